@@ -1,4 +1,4 @@
-"""A blind junction that can be heard: scene, vehicle, propagation, background, camera, data set."""
+"""Simulation of blind junctions: scene, vehicles, propagation, background, camera, data sets."""
 
 import lazy_loader
 

@@ -1,1 +1,1 @@
-"""What the camera sees of a simulated street."""
+"""Camera images and detections of a simulated street."""

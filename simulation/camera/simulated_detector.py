@@ -1,4 +1,4 @@
-"""What the camera's detector reports: boxes that begin at line of sight, with its small imperfections."""
+"""Boxes of the simulated detector: they begin at line of sight and have small errors."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -15,7 +15,7 @@ from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import LIGHT, VehicleKind
 from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, LENGTH_M, WIDTH_M, Trajectory
 
-LEAST_VISIBLE = 0.2  # share of the vehicle's length that a detector needs
+LEAST_VISIBLE = 0.2  # Visible share of the vehicle's length that a detector needs
 # Miss rates measured in the paper: 4 % at boresight, 14 % at 20-30 deg.
 MISS_AZIMUTH_DEG = (0.0, 10.0, 25.0)
 MISS_RATE = (0.04, 0.04, 0.14)
@@ -36,7 +36,7 @@ Frame = tuple[SimulatedDetection, ...]
 
 
 def visible_part(trajectory: Trajectory, site: Site, camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
-    """Lateral limits (right, left) of what the camera sees of the vehicle, (T,); empty if right > left."""
+    """Return the lateral limits (right, left) of the visible part, (T,); empty if right > left."""
     ahead, _ = trajectory.behind(0.0)
     right_limit, left_limit = site.sights_m(ahead, camera.position_m[:2])
     right, left = trajectory.footprint_y_m()
@@ -46,14 +46,14 @@ def visible_part(trajectory: Trajectory, site: Site, camera: PinholeCamera) -> t
 def line_of_sight(
     trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
 ) -> BoolArray:
-    """Tell when the middle of the vehicle's front is in the camera's view, shape (T,)."""
+    """Return when the middle of the vehicle's front is in view, shape (T,)."""
     return camera_sees(site, camera, *trajectory.behind(0.0), ego_x_m)
 
 
 def detect(
     trajectory: Trajectory, site: Site, camera: PinholeCamera, rng: np.random.Generator
 ) -> list[Frame]:
-    """Boxes of a passing vehicle, one tuple per frame of `trajectory`."""
+    """Return boxes of a passing vehicle, one tuple per frame of `trajectory`."""
     right, left = visible_part(trajectory, site, camera)
     seen, kind = line_of_sight(trajectory, site, camera), trajectory.kind
     frames: list[Frame] = []
@@ -72,7 +72,7 @@ def detect(
 
 
 def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generator) -> list[Frame]:
-    """Boxes of a car that stands at the far kerb for the whole recording."""
+    """Return boxes of a car that is parked at the far kerb for the whole recording."""
     x = site.far_kerb_m - 0.5 * WIDTH_M
     right, left = site.sight_m(x, camera.position_m[:2])
     middle = rng.uniform(0.6 * right, 0.6 * left)
@@ -89,10 +89,10 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
 def through_rain(
     frames: Sequence[Frame], showers: Iterable[tuple[float, float, float]], rng: np.random.Generator
 ) -> list[Frame]:
-    """Lose the boxes that drops on the lens take in showers, given by begin, end and share."""
+    """Remove the boxes that drops on the lens hide in showers, given by begin, end and share."""
     missed, time = np.zeros(len(frames)), np.arange(len(frames)) / FRAME_RATE_HZ
     for begin_s, end_s, share in showers:
-        # A lens dries when the rain is over; how long that takes is not modelled.
+        # The lens is dry when the rain ends; drying is not modelled.
         missed = np.maximum(missed, share * ((time >= begin_s) & (time < end_s)))
     return [
         tuple(box for box in frame if rng.random() >= share)
@@ -114,7 +114,7 @@ def to_json(frames: list[Frame]) -> dict[str, Any]:
 
 
 def miss_rate(ahead_m: float, lateral_m: float) -> float:
-    """Return how often a vehicle there is missed, by its azimuth."""
+    """Return the miss rate of a vehicle at a position, by its azimuth."""
     azimuth_deg = abs(math.degrees(math.atan2(lateral_m, ahead_m)))
     return float(np.interp(azimuth_deg, MISS_AZIMUTH_DEG, MISS_RATE))
 
@@ -122,7 +122,7 @@ def miss_rate(ahead_m: float, lateral_m: float) -> float:
 def project(
     camera: PinholeCamera, site: Site, middle_x: float, ends_y: tuple[float, float], kind: VehicleKind = LIGHT
 ) -> FloatArray | None:
-    """Box (left, top, right, bottom) around the visible cuboid; None where it is outside the image."""
+    """Return the box (left, top, right, bottom) of the visible cuboid; None if it is outside the image."""
     x = middle_x + kind.width_m * np.array([-0.5, 0.5])
     z = np.array([0.0, kind.height_m]) - ARRAY_HEIGHT_M
     # A corner hides more of the near face than of the far one.

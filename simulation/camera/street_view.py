@@ -1,4 +1,4 @@
-"""The street as the camera sees it without a vehicle: ground, side walls, corners, what stands opposite."""
+"""Camera view of the street without a vehicle: ground, side walls, corners, opposite side."""
 
 import math
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M
 # From two coordinates on a surface to red, green, blue in 0..255, shape (..., 3).
 Paint = Callable[[Float32Array, Float32Array], Float32Array]
 
-OVERSAMPLING = 2  # rays across a pixel and down
+OVERSAMPLING = 2  # Rays per pixel in each direction
 NEAREST_M = 0.05
 
 
@@ -31,21 +31,21 @@ class Patch:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """For indexing an array of rays."""
+        """Index of an array of rays."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     @property
     def pixels(self) -> tuple[slice, slice]:
-        """For indexing an image; whole pixels only."""
+        """Index of an image; whole pixels only."""
         n = OVERSAMPLING
         return slice(self.top // n, self.bottom // n), slice(self.left // n, self.right // n)
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A pinhole camera with a few rays a pixel."""
+    """A pinhole camera with several rays per pixel."""
 
-    camera: PinholeCamera  # Size of the image, angle of view, place and direction
+    camera: PinholeCamera  # Size of the image, angle of view, position and direction
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -63,7 +63,7 @@ class View:
         return 0.5 * self.shape[1] / math.tan(self.camera.half_angle_rad)
 
     def rays(self, patch: Patch) -> Float32Array:
-        """Directions in `base_link`, one unit long along the optical axis, shape (rows, columns, 3)."""
+        """Return directions in `base_link`, of unit length along the optical axis, (rows, columns, 3)."""
         rows, columns = self.shape
         left = (0.5 * columns - 0.5 - np.arange(patch.left, patch.right)) / self.focal
         up = (0.5 * rows - 0.5 - np.arange(patch.top, patch.bottom)) / self.focal
@@ -72,7 +72,7 @@ class View:
         return np.asarray(rays, np.float32)
 
     def around(self, points_m: FloatArray) -> Patch | None:
-        """Return whole pixels around the projection of points ahead, (n, 3); None where it is outside."""
+        """Return whole pixels around the projection of points ahead, (n, 3); None if it is outside."""
         ahead, left, up = (self._axes @ (points_m - self.camera.position_m).T).astype(np.float64)
         ahead = np.maximum(ahead, NEAREST_M)
         rows, columns = self.shape
@@ -93,7 +93,7 @@ class View:
 
 
 def _whole(values: FloatArray, limit: int) -> tuple[int, int]:
-    """First and last ray of the pixels that hold all values, within the image."""
+    """Return the first and last ray of the pixels that contain all values, within the image."""
     n = OVERSAMPLING
     low, high = np.clip([values.min(), values.max()], -n, limit + n)
     return max(int(low) // n * n, 0), min((int(high) // n + 1) * n, limit)
@@ -101,11 +101,11 @@ def _whole(values: FloatArray, limit: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A rectangle across one axis, painted."""
+    """A painted rectangle perpendicular to one axis."""
 
-    axis: int  # 0, 1 or 2: the coordinate that is constant
+    axis: int  # The constant coordinate: 0, 1 or 2
     at_m: float  # Its value
-    # Ranges of the two others, in the order of the axes.
+    # Ranges of the other two coordinates, in the order of the axes.
     limits_m: tuple[tuple[float, float], tuple[float, float]]
     paint: Paint  # Colour by those two coordinates
 
@@ -113,7 +113,7 @@ class Panel:
 def cast_panels(
     view: View, patch: Patch, panels: list[Panel], sky: Paint
 ) -> tuple[Float32Array, Float32Array]:
-    """Paint a patch of rays with the nearest panel that each meets, or the sky."""
+    """Paint a patch of rays with the nearest panel that each ray meets, or the sky."""
     rays, eye = view.rays(patch), view.camera.position_m
     image = sky(rays[..., 1] / rays[..., 0], rays[..., 2] / rays[..., 0])
     depth = np.full(rays.shape[:2], np.inf, np.float32)
@@ -133,7 +133,7 @@ def cast_panels(
 def cast_solid(
     rays: Float32Array, eye_m: FloatArray, normals: FloatArray, offsets: FloatArray
 ) -> tuple[Float32Array, IndexArray]:
-    r"""Meet a convex solid :math:`\{p : n_k \cdot p \le o_k\}`.
+    r"""Intersect rays with a convex solid :math:`\{p : n_k \cdot p \le o_k\}`.
 
     Shapes: rays (rows, columns, 3), eye_m (3,), normals, offsets (K, 3), returns (rows, columns).
     """
@@ -144,7 +144,7 @@ def cast_solid(
         towards = rays @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = gap / towards
-        # A ray along a face never meets it; outside of that face it misses the solid.
+        # A ray parallel to a face never meets it; outside of that face it misses the solid.
         leave[(towards == 0.0) & (gap < 0.0)] = -np.inf
         np.minimum(leave, reach, out=leave, where=towards > 0.0)
         later = (towards < 0.0) & (reach > enter)
@@ -177,7 +177,7 @@ GLASS: Colour = (58.0, 66.0, 74.0)
 
 
 def cell_noise(a: ArrayLike, b: ArrayLike, seed: int) -> Float32Array:
-    """Draw a number in [0, 1) for every whole pair of coordinates, always the same for the same seed.
+    """Return a number in [0, 1) for every integer pair of coordinates, always the same for the same seed.
 
     Examples
     --------
@@ -193,7 +193,7 @@ def cell_noise(a: ArrayLike, b: ArrayLike, seed: int) -> Float32Array:
 
 
 def smooth_noise(a: Float32Array, b: Float32Array, cell_m: float, seed: int) -> Float32Array:
-    """Noise in [0, 1) without edges, features of about `cell_m`."""
+    """Return smooth noise in [0, 1), with features of about `cell_m`."""
     x, y = a / np.float32(cell_m), b / np.float32(cell_m)
     left, low = np.floor(x), np.floor(y)
     fx, fy = _ease(x - left), _ease(y - low)
@@ -207,7 +207,7 @@ def _ease(t: Float32Array) -> Float32Array:
 
 
 def tinted(colour: Colour, shade: ArrayLike) -> Float32Array:
-    """Return a colour times a shade of any shape, with a last axis of three."""
+    """Return a colour times a shade of any shape; the last axis has length three."""
     return np.asarray(np.asarray(shade, np.float32)[..., None] * np.array(colour, np.float32), np.float32)
 
 
@@ -242,13 +242,13 @@ def leaves(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
 
 
 def brick(a: Float32Array, b: Float32Array, colour: Colour, seed: int) -> Float32Array:
-    """Paint a wall in stretcher bond, a along it, b up."""
+    """Paint a wall in stretcher bond, a along the wall, b upwards."""
     weather = 0.9 + 0.2 * smooth_noise(a, b, 1.8, seed + 7)
     return tinted(colour, weather * _courses(a, b, BRICK_M, COURSE_M, seed))
 
 
 def _courses(a: Float32Array, b: Float32Array, length_m: float, height_m: float, seed: int) -> Float32Array:
-    """Shade of stones in courses, every other one half a stone along, joints darker."""
+    """Return the shade of stones in courses, shifted by half a stone in turn, with dark joints."""
     course = np.floor(b / np.float32(height_m))
     along = a / np.float32(length_m) + 0.5 * np.mod(course, 2.0)
     shade = 0.85 + 0.3 * cell_noise(along, course, seed)
@@ -258,16 +258,16 @@ def _courses(a: Float32Array, b: Float32Array, length_m: float, height_m: float,
 
 @dataclass(frozen=True, slots=True)
 class Facade:
-    """A house front: brick, windows in every storey, doors at the ground."""
+    """A house front: brick, windows on every storey, doors on the ground floor."""
 
-    colour: Colour  # Of the brick
+    colour: Colour  # Colour of the brick
     bay_m: float  # Distance between windows
     foot_m: float  # Coordinate of the ground
-    brightness: float  # Of the light that falls on it
-    seed: int  # Which house
+    brightness: float  # Brightness of the incident light
+    seed: int  # Seed of the house
 
     def paint(self, a: Float32Array, b: Float32Array) -> Float32Array:
-        """Colours at places along the wall and up."""
+        """Return the colours at positions along the wall and upwards."""
         up = b - np.float32(self.foot_m)
         image = brick(a, up, self.colour, self.seed)
         bay, storey = np.floor(a / self.bay_m), np.floor(up / STOREY_M)
@@ -283,14 +283,14 @@ class Facade:
             pane &= (y > low + FRAME_M) & (y < OPENING_TOP_M - FRAME_M)
             image[pane] = tinted(opening.colour, mirrored * np.where(drawn, 1.5, 1.0))[pane]
             image[here & (np.abs(x) < half + 0.08) & (y > low - opening.sill_m) & (y < low)] = SILL
-        # Walls are darker at their foot, where less of the sky is seen.
+        # Walls are darker at their foot, which receives less light from the sky.
         light = self.brightness * (0.72 + 0.28 * np.clip(up / 1.5, 0.0, 1.0))
         return np.asarray(image * light[..., None], np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class _Opening:
-    """Half the width of a hole in a wall, where it begins, the height of its sill, what fills it."""
+    """Half width of an opening in a wall, its start, the height of its sill, and its filling."""
 
     half_m: float
     low_m: float
@@ -304,10 +304,10 @@ DOOR = _Opening(0.45, 0.0, 0.0, (70.0, 82.0, 78.0))
 
 ROAD_Z_M = -ARRAY_HEIGHT_M
 FAR_M = 150.0
-# The corner of a building stands out from its side wall on the last metre.
+# The corner of a building projects from its side wall on the last metre.
 PIER_M = 1.0
 PAVEMENT_M = 0.9
-# Sites without a wall opposite open on a verge with a hedge; houses stand behind.
+# Sites without a wall opposite have a verge with a hedge and houses behind.
 HEDGE_AHEAD_M, HEDGE_HEIGHT_M, HOUSES_AHEAD_M = 16.0, 1.7, 34.0
 STRIP_ROWS = 64
 BRICKS = ((134.0, 92.0, 76.0), (150.0, 120.0, 96.0), (116.0, 88.0, 80.0), (160.0, 146.0, 124.0))
@@ -315,14 +315,14 @@ BRICKS = ((134.0, 92.0, 76.0), (150.0, 120.0, 96.0), (116.0, 88.0, 80.0), (160.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreetView:
-    """What does not move, painted once."""
+    """The static part of the view, painted once."""
 
     view: View  # The camera
-    image: ImageArray  # shape (rows, columns, 3): One colour a ray
+    image: ImageArray  # shape (rows, columns, 3): One colour per ray
     depth: Float32Array  # shape (rows, columns): Metres along the optical axis
 
     def pixels(self) -> Float32Array:
-        """Return the image itself, shape (height, width, 3)."""
+        """Return the image, shape (height, width, 3)."""
         rows = range(0, self.image.shape[0], STRIP_ROWS * OVERSAMPLING)
         step = STRIP_ROWS * OVERSAMPLING
         return np.concatenate([reduced(self.image[row : row + step].astype(np.float32)) for row in rows])
@@ -331,7 +331,7 @@ class StreetView:
 # Painting takes 4 s, a third of a recording's video. Five sites of 66 MB each: those of OVAD.
 @lru_cache(maxsize=5)
 def paint_street(site: Site, view: View) -> StreetView:
-    """Paint a site; it has the same face in every recording."""
+    """Paint a site; it is the same in every recording."""
     panels = street_panels(site)
     rows, columns = view.shape
     image, depth = np.empty((rows, columns, 3), np.uint8), np.empty((rows, columns), np.float32)
@@ -360,7 +360,7 @@ def street_panels(site: Site) -> list[Panel]:
 
 
 def _building(site: Site, side: float, front: Facade, height_m: float) -> list[Panel]:
-    """Side wall, the return of the corner pier, and the pier itself; side is +1 left, -1 right."""
+    """Return side wall, return of the corner pier, and the pier itself; side is +1 left, -1 right."""
     wall = site.side_wall_left_m if side > 0 else site.side_wall_right_m
     corner = site.corner_left_m if side > 0 else site.corner_right_m
     start, end = site.corner_ahead_m - PIER_M, site.corner_ahead_m
@@ -418,13 +418,13 @@ class _Ground:
         return np.asarray(line | (tooth & (depth > 0.0) & (depth < 0.6) & between))
 
     def _light(self, ahead: Float32Array, left: Float32Array) -> Float32Array:
-        """Less light at the foot of the walls of the ego's street."""
+        """Return the light, which is lower at the foot of the walls of the ego's street."""
         gap = np.minimum(self.site.side_wall_left_m - left, left + self.site.side_wall_right_m)
         inside = 0.65 + 0.35 * np.clip(gap / 1.2, 0.0, 1.0)
         return np.where(ahead < self.site.corner_ahead_m, inside, 1.0).astype(np.float32)
 
 
 def _sky(left: Float32Array, up: Float32Array) -> Float32Array:
-    """Overcast, brighter towards the horizon."""
+    """Return an overcast sky, brighter towards the horizon."""
     clouds = 0.97 + 0.06 * smooth_noise(left, up * 2.0, 0.3, 1)
     return tinted((206.0, 211.0, 217.0), clouds * (1.04 - 0.12 * np.clip(up, 0.0, 1.0)))

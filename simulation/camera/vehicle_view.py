@@ -1,7 +1,7 @@
-"""A car as the camera sees it: body and cabin as convex solids, wheels, glass, lights, and its shadow.
+"""Camera view of a car: body and cabin as convex solids, wheels, glass, lights, and its shadow.
 
-Its own coordinates are metres across (x of `base_link` from the lane's middle), behind the front, and above
-the road.
+The car's own coordinates are metres across (x of `base_link` from the lane's middle), behind the front, and
+above the road.
 """
 
 from dataclasses import dataclass, replace
@@ -20,17 +20,17 @@ PAINTS: tuple[Colour, ...] = (
 TYRE: Colour = (34.0, 34.0, 35.0)
 RIM: Colour = (158.0, 160.0, 163.0)
 DARK: Colour = (24.0, 24.0, 26.0)
-UNDER: Colour = (46.0, 46.0, 47.0)  # road in the shade below the car
+UNDER: Colour = (46.0, 46.0, 47.0)  # Shaded road below the car
 LAMP: Colour = (226.0, 228.0, 224.0)
 TAIL: Colour = (146.0, 26.0, 26.0)
 HALF_M = 0.5 * WIDTH_M
 WAIST_M, NOSE_M, SILL_M, CLEARANCE_M = 0.88, 0.68, 0.26, 0.15
 WHEEL_M, RIM_M, ARCH_M = 0.31, 0.2, 0.37
-BUMPER_M = 0.16  # how far the ends lean in up to the waist
-# Behind the front: foot and top of the windscreen, top and foot of the rear window.
+BUMPER_M = 0.16  # Inclination of the ends up to the waist
+# Distances behind the front: foot and top of the windscreen, top and foot of the rear window.
 SCREEN_M, REAR_WINDOW_M = (1.15, 1.95), (3.75, 4.15)
 SEAMS_M = (1.3, 2.42, 3.4)
-TUMBLE = 0.22  # how far the cabin's sides lean in per metre of height
+TUMBLE = 0.22  # Inclination of the cabin's sides per metre of height
 SHADOW, SHADOW_REACH_M = 0.55, 0.45
 
 # Faces as normals n and offsets o of n . p <= o, in the car's own coordinates.
@@ -64,10 +64,10 @@ class Car:
     lane_x_m: float  # Middle of its lane and its front bumper, in `base_link`
     front_y_m: float
     heading: int  # +1 towards +y, -1 towards -y
-    colour: Colour  # Of the paint
+    colour: Colour  # Colour of the paint
 
     def corners_m(self) -> FloatArray:
-        """Corners of the cuboid that holds the car and its shadow, in `base_link`, shape (8, 3)."""
+        """Return the corners of the cuboid around the car and its shadow, in `base_link`, shape (8, 3)."""
         x = self.lane_x_m + (HALF_M + SHADOW_REACH_M) * np.array([-1.0, 1.0])
         rear = self.front_y_m - self.heading * LENGTH_M
         y = np.sort([self.front_y_m, rear]) + SHADOW_REACH_M * np.array([-1.0, 1.0])
@@ -75,15 +75,15 @@ class Car:
 
 
 def add_car(street: StreetView, car: Car, image: Float32Array) -> None:
-    """Draw a car into an image (height, width, 3) wherever nothing of the street stands before it."""
+    """Draw a car into an image (height, width, 3), except where the street hides it."""
     patch = street.view.around(car.corners_m())
     if patch is not None:
         image[patch.pixels] = reduced(_painted(street, car, patch))
 
 
 def with_parked_car(street: StreetView, car: Car) -> StreetView:
-    """Return the street with a car that belongs to it."""
-    # It hides nothing that drives: narrow streets have lanes that parked cars reach into.
+    """Return the street with a parked car."""
+    # It hides no moving vehicle: in narrow streets parked cars extend into the lanes.
     patch = street.view.around(car.corners_m())
     if patch is None:
         return street
@@ -93,10 +93,10 @@ def with_parked_car(street: StreetView, car: Car) -> StreetView:
 
 
 def _painted(street: StreetView, car: Car, patch: Patch) -> Float32Array:
-    """Colours of the rays of a patch, shape (rows, columns, 3)."""
+    """Return the colours of the rays of a patch, shape (rows, columns, 3)."""
     colours = street.image[patch.slices].astype(np.float32)
     depth = street.depth[patch.slices].copy()
-    # From `base_link` to the car's own coordinates: the eye, shape (3,), and the rays from it.
+    # From `base_link` to the car's own coordinates: the viewpoint, shape (3,), and its rays.
     x, y, z = street.view.camera.position_m
     eye = np.array([x - car.lane_x_m, (car.front_y_m - y) * car.heading, z - ROAD_Z_M])
     rays = street.view.rays(patch) * np.array([1.0, -car.heading, 1.0], np.float32)

@@ -52,14 +52,14 @@ from .recording import SimulatedRecording, put_in_place, refuse_foreign, simulat
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
 JUNCTION, ALL = "junction", "all"
-# Below, nothing is left of the band that bearings and features are taken from; above, it stays as it is.
+# Below, the band of bearings and features is empty; above, it does not change.
 BANDWIDTHS_HZ = (700.0, 16_000.0)
 APPROACH_SIDES = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What the recording number `number` of a data set is, before anything is drawn."""
+    """Properties of the recording `number` of a data set, before anything is drawn."""
 
     number: int
     environment: str
@@ -70,40 +70,40 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class DatasetSettings:
-    """How a data set is made up.
+    """Composition of a data set.
 
     Parameters
     ----------
     n_static, n_dynamic : int
-        Recordings with a standing ego and with one that drives up to the corner; in either group every other
-        one is hazard-free.
+        Number of recordings with a standing ego, and with one that drives up to the corner; half of each are
+        hazard-free.
     seed : int
-        Of the whole data set.
+        Seed of the whole data set.
     scene : str
-        "junction", or one of `PLACES`, where the ego only stands and a vehicle comes from the sides that the
-        place has; "all" for the junctions and every place in turn.
+        "junction"; one of `PLACES`, where the ego stands and a vehicle comes from the sides of the place; or
+        "all" for the junctions and every place in turn.
     kind : str
-        What drives there, one of `KINDS`.
+        Kind of the vehicles, one of `KINDS`.
     duration_s : float
         Length of every recording, 0.5 to 60 s.
     video : bool
-        Write what the camera sees, too; sound, detections and truth are the same with and without. Only for
+        Whether to write the camera images, too; sound, detections and truth do not depend on it. Only for
         a standing ego at a junction.
     video_width_px : int
-        Width of its images, 64 to 1936, OVAD's; the height follows. Boxes are those of the full size.
+        Width of the images, 64 to 1936 (OVAD's); the height follows. Boxes refer to the full size.
     bandwidth_hz : float, optional
-        Render up to here only, 700 to 16,000 Hz, at the rate `rate_for`; the full rate if not given.
+        Upper limit of the rendered band, 700 to 16,000 Hz, at the rate `rate_for`; the full rate by default.
     sounds : tuple of str
-        What else sounds in every recording, of `SOUNDS`; a vehicle's signal is its own where there is one.
+        Further sounds in every recording, from `SOUNDS`; a vehicle's signal belongs to the vehicle, if any.
     preset : str
-        Name of the levels of everything that is not geometry.
+        Name of the levels and spectra of everything that is not geometry.
     sounds_folder : str
-        Recordings, a folder a kind of sound, that take the place of synthesis; none where empty.
+        Folder of recordings, one folder per kind of sound, that replace synthesis; none if empty.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range, a word unknown or a combination not to be had.
+        If a number is out of range, a word is unknown or a combination is impossible.
 
     Examples
     --------
@@ -145,14 +145,14 @@ class DatasetSettings:
             raise InvalidArgumentError("video: expected only static recordings of the scene 'junction'")
 
     def camera(self) -> PinholeCamera:
-        """Return the camera of the video: OVAD's, with images of the width that is wanted."""
+        """Return the camera of the video: OVAD's, with images of the chosen width."""
         whole = PinholeCamera.ovad()
-        # An even height: the codec takes no other.
+        # The codec requires an even height.
         height_px = 2 * round(0.5 * whole.height_px * self.video_width_px / whole.width_px)
         return PinholeCamera.ovad(width_px=self.video_width_px, height_px=height_px)
 
     def plans(self) -> list[Plan]:
-        """Return what every recording is: site after site, the standing ego first.
+        """Return the plan of every recording: site after site, the standing ego first.
 
         Examples
         --------
@@ -175,14 +175,14 @@ class DatasetSettings:
 
 
 def _site_and_approach(number: int, names: tuple[str, ...]) -> tuple[str, str]:
-    """Return site after site with an approach each, and the same without."""
+    """Return the site and the approach of a recording; every other one has no approach."""
     pair = number // 2
     name = names[pair % len(names)]
     if number % 2:
         return name, "none"
     known = place_of(name)
     sides = APPROACH_SIDES if known is None else known.approaches
-    # An even number of sites would otherwise give each the same side for ever.
+    # With an even number of sites each site would otherwise always have the same side.
     turn = pair + (pair // len(names) if len(names) % 2 == 0 else 0)
     return name, sides[turn % len(sides)]
 
@@ -204,7 +204,7 @@ class LogRow:
 
     @property
     def folder(self) -> Path:
-        """Where the recording lies below the root.
+        """Folder of the recording below the root.
 
         Examples
         --------
@@ -225,38 +225,38 @@ def write_dataset(
 ) -> list[LogRow]:
     """Simulate a data set.
 
-    The same settings give the same bytes, whatever the number of jobs: every recording has a seed of its own.
-    Interrupted, it leaves the recordings that were finished in their order, and the log that lists them.
+    The same settings give the same bytes for any number of jobs, because every recording has its own seed. An
+    interrupted call leaves the recordings that were finished in order, and the log that lists them.
 
     Parameters
     ----------
     root : str or Path
-        Folder to write to; made if it is not there. Simulated recordings of the same name are replaced,
-        and others that its log lists stay listed.
+        Output folder; it is created if needed. Simulated recordings of the same name are replaced, and
+        others in its log stay listed.
     settings : DatasetSettings, optional
-        What to write; four recordings of junctions if not given.
+        Settings of the data set; four recordings of junctions by default.
     array : MicrophoneArray, optional
-        What listens; the data set names it in `array.xml`. Default `ovad_array`.
+        The array; the data set stores it in `array.xml`. Default `ovad_array`.
     jobs : int
         Processes, 1 to 256.
     progress : callable, optional
-        Called with every recording in order, once it is finished or found to be there.
+        Called with every recording in order, once it is finished or found.
     go_on : bool
-        Leave recordings that the log lists and that are of these settings: what was interrupted is finished.
+        Whether to keep listed recordings of these settings and continue an interrupted call.
 
     Returns
     -------
     list of LogRow
-        The lines of `DataLog.csv`, of what was simulated by this call.
+        The lines of `DataLog.csv` that this call simulated.
 
     Raises
     ------
     InvalidArgumentError
         If a number is out of range.
     InputFileError
-        If something that was not simulated stands where a recording would go, or recordings of another array.
+        If a target folder exists and is not simulated, or holds recordings of another array.
     MissingExtraError
-        If video is wanted and OpenCV is not installed.
+        If video is requested and OpenCV is not installed.
 
     Examples
     --------
@@ -304,28 +304,28 @@ def write_recording(
     number: int = 0,
     frames: Iterable[ImageArray] | None = None,
 ) -> LogRow:
-    """Write one recording below `root`, whole or not at all, and the array of the data set beside it.
+    """Write one recording below `root`, completely or not at all, and the array of the data set beside it.
 
     Parameters
     ----------
     root : str or Path
         Existing folder of the data set.
     recording : SimulatedRecording
-        What to write; site and approach are in its truth.
+        The recording; its truth has site and approach.
     number : int
         Running number in the ID, 0..9999.
     frames : iterable of ndarray, optional
-        What the camera sees, from `camera_frames`; no video where not given.
+        Camera images, from `camera_frames`; no video if not given.
 
     Returns
     -------
     LogRow
-        Its line in `DataLog.csv`; ``root / row.folder`` is where it lies.
+        Its line in `DataLog.csv`; ``root / row.folder`` is its folder.
 
     Raises
     ------
     InputFileError
-        If something that was not simulated stands there, or the data set is of another array.
+        If the target folder exists and is not simulated, or the data set has another array.
 
     Examples
     --------
@@ -370,7 +370,7 @@ def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
 def _drawn(
     wanted: DatasetSettings, array: MicrophoneArray, plan: Plan
 ) -> tuple[SimulationSettings, np.random.Generator]:
-    """Return what a recording is, and the generator that goes on to simulate it."""
+    """Return the settings of a recording, and the generator that simulates it."""
     rng = np.random.default_rng(plan.seed)
     levels = replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder)
     settings = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind, levels)
@@ -384,7 +384,7 @@ def _drawn(
 def _simulate_one(
     root: Path, wanted: DatasetSettings, array: MicrophoneArray, item: tuple[Plan, Path | None]
 ) -> LogRow | None:
-    """Write a recording below `root`; None if it is of these settings where it is kept."""
+    """Write a recording below `root`; return None if a recording of these settings is kept."""
     plan, kept = item
     settings, rng = _drawn(wanted, array, plan)
     if kept is not None:
@@ -392,7 +392,7 @@ def _simulate_one(
         if isinstance(truth, dict) and truth.get("settings") == json.loads(json.dumps(asdict(settings))):
             return None
     recording = simulate_recording(settings, rng, array)
-    # A generator of its own: what is drawn for the picture changes nothing else.
+    # The images have their own generator, so that the rest does not change with video.
     frames = None
     if wanted.video:
         frames = camera_frames(settings, recording, rng.spawn(1)[0], wanted.camera())
@@ -414,7 +414,7 @@ def _name_array(path: Path, array: MicrophoneArray) -> None:
 
 
 def _listed(root: Path) -> dict[Path, LogRow]:
-    """Return what the log of an existing data set lists and is there."""
+    """Return the recordings that the log of a data set lists and that exist."""
     if not (root / LOG_NAME).exists():
         return {}
     found = [recording for recording in OvadDataset(root).recordings if recording.path.is_dir()]
@@ -423,8 +423,8 @@ def _listed(root: Path) -> dict[Path, LogRow]:
 
 
 CODEC = "mp4v"
-SENSOR_NOISE = 1.5  # grey levels
-# Ten standard deviations of a parked car's box, less than a moving one passes in a frame.
+SENSOR_NOISE = 1.5  # Grey levels
+# Ten standard deviations of a parked car's box; a moving vehicle moves further in a frame.
 STILL_PX = 4.0
 STEP_M = 0.01
 
@@ -435,7 +435,7 @@ def camera_frames(
     rng: np.random.Generator,
     camera: PinholeCamera | None = None,
 ) -> Iterator[ImageArray]:
-    """Yield what the camera sees, ten frames a second.
+    """Yield the camera images, ten frames per second.
 
     Examples
     --------
@@ -447,9 +447,9 @@ def camera_frames(
     >>> len(frames), frames[0].shape, frames[0].dtype
     (6, (60, 96, 3), dtype('uint8'))
     """
-    # The street is the site's own; buildings hide the vehicle until its front passes the line of sight past
-    # their corner, which is the recording's T0. Light is even and the camera stands still, so that all that
-    # changes is the vehicle, its shadow and the sensor's noise.
+    # The street depends on the site; buildings hide the vehicle until its front passes the line of sight at
+    # their corner, which is the recording's T0. Light is constant and the camera stands, so that the images
+    # change by the vehicle, its shadow and the sensor's noise only.
     view = View(camera or PinholeCamera.ovad())
     paint, parked_paint = (PAINTS[i] for i in rng.integers(len(PAINTS), size=2))
     street = paint_street(settings.site, view)
@@ -470,7 +470,7 @@ def camera_frames(
 
 
 def write_video(path: str | Path, frames: Iterable[ImageArray]) -> None:
-    """Write frames of one size as MPEG-4, whole or not at all.
+    """Write frames of one size as MPEG-4, completely or not at all.
 
     Shapes: frames (height, width, 3).
     """
@@ -498,7 +498,7 @@ def parked_lane_m(site: Site) -> float:
 
 
 def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
-    """Read back from its boxes where the parked car stands along the street; None where there is none."""
+    """Return the position of the parked car along the street from its boxes; None without a car."""
     boxes = np.array([frame[0].box_px for frame in detections if frame])
     still = boxes[(np.abs(boxes - boxes[:1]) < STILL_PX).all(axis=1)] if len(boxes) else boxes
     if not len(still):
@@ -513,8 +513,8 @@ def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
 
 
 def _columns_px(camera: PinholeCamera, ahead_m: FloatArray, ends_m: FloatArray) -> FloatArray:
-    """First and last column of cuboids whose faces (2,) end at (n, 2, 2) (right, left), shape (n, 2)."""
-    # At the camera's own height, where the pitch shortens the depth and nothing else.
+    """Return the first and last column of cuboids whose faces (2,) end at (n, 2, 2), shape (n, 2)."""
+    # At the camera's own height, where the pitch only shortens the depth.
     slope = (ends_m - camera.position_m[1]) / ((ahead_m - camera.position_m[0]) * np.cos(camera.pitch_rad))
     focal = 0.5 * camera.width_px / np.tan(camera.half_angle_rad)
     columns = np.clip(0.5 * camera.width_px - focal * slope, 0.0, camera.width_px - 1.0).reshape(-1, 4)
@@ -522,7 +522,7 @@ def _columns_px(camera: PinholeCamera, ahead_m: FloatArray, ends_m: FloatArray) 
 
 
 def _taken(image: Float32Array, rng: np.random.Generator) -> ImageArray:
-    """Add the sensor's noise, alike in all colours, and round; red, green, blue become blue, green, red."""
+    """Add sensor noise, equal in all colours, and round; RGB becomes BGR."""
     noise = rng.standard_normal(image.shape[:2], dtype=np.float32)
     noise *= SENSOR_NOISE
     taken = image[:, :, ::-1] + noise[:, :, None]

@@ -33,14 +33,13 @@ SCHEMA_VERSION = "1.2.0"
 def describe(
     settings: SimulationSettings, frames_s: FloatArray, seen: list[Trajectory], sights: list[BoolArray]
 ) -> dict[str, Any]:
-    """Return settings and, per camera frame, where the vehicles and the ego are, ready for JSON."""
+    """Return the settings and, per camera frame, the positions of all vehicles, ready for JSON."""
     # Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`,
     # `azimuth_rad` (of the front axle, left positive), `range_m`, `line_of_sight` (whether the front is in
-    # the camera's view: between the edges of its image, and nothing stands before it), `time_to_visible_s`
-    # (negative afterwards, null where it never comes into view). `frames` are those of the vehicle that
-    # `approach` names, `others` those of the rest. Without the former there are no frames and `entry_s` is
-    # null. `ego` has the ego's way along its street, 0 where it stops. `sounds` has the azimuth and range of
-    # what else sounds at a place, and when.
+    # view: between the edges of the image and not hidden), `time_to_visible_s` (negative afterwards, null if
+    # it never comes into view). `frames` are those of the vehicle of `approach`, `others` those of the rest.
+    # Without the former there are no frames and `entry_s` is null. `ego` has the ego's position along its
+    # street, 0 at its stop. `sounds` has the azimuth, range and time of other placed sounds.
     ego_x = settings.ego.x_m(frames_s)
     entries = [comes_into_view_s(settings, vehicle) for vehicle in settings.traffic]
     frames = [_frames(*one, ego_x) for one in zip(seen, sights, entries, strict=True)]
@@ -97,12 +96,12 @@ def _frames(
     ]
 
 
-WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # a WAV counts its bytes in 32 bits; beyond it is RF64
+WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # A WAV file has 32-bit sizes; a longer file is RF64
 SAMPLE_BYTES = 3
 
 
 def sound_format(samples: int, channels: int) -> str:
-    """Return the container that holds so many samples of 24 bits.
+    """Return the container for a number of 24-bit samples.
 
     Examples
     --------
@@ -116,7 +115,7 @@ def sound_format(samples: int, channels: int) -> str:
 def sound_writer(
     path: Path, samples: int, channels: int, sample_rate_hz: float
 ) -> Iterator[soundfile.SoundFile]:
-    """Open a file for so many samples of 24 bits, which are written at once or block by block."""
+    """Open a file for a number of 24-bit samples, which are written at once or in blocks."""
     kind = sound_format(samples, channels)
     try:
         with soundfile.SoundFile(path, "w", round(sample_rate_hz), channels, "PCM_24", format=kind) as file:
@@ -127,28 +126,28 @@ def sound_writer(
 
 
 def refuse_foreign(target: Path) -> None:
-    """Refuse to replace a folder that holds no simulated truth."""
+    """Refuse to replace a folder without simulated truth."""
     if target.exists() and not (target / TRUTH_NAME).is_file():
         raise InputFileError(target, "expected a free name or a simulated recording, found something else")
 
 
 def put_in_place(target: Path, finished: Path) -> None:
-    """Put a finished folder in the place of an old one, which goes with the parent of the new one."""
+    """Move a finished folder to its place; an old folder is removed with the parent of the new one."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.exists():
         target.replace(finished.with_suffix(".old"))
     finished.replace(target)
 
 
-FULL_SCALE_PA = 20.0  # 120 dB, where measurement microphones of this kind end
-HEAD_START_S = 2.0  # emission begins this long before the recording: travel time and late field
+FULL_SCALE_PA = 20.0  # 120 dB, the upper limit of such measurement microphones
+HEAD_START_S = 2.0  # Emission begins this long before the recording: travel time and late field
 SAMPLES_AT_ONCE = 1024
-NO_VEHICLE_T0 = 0.7  # OVAD gives recordings without a vehicle frame 70 of 100
+NO_VEHICLE_T0 = 0.7  # OVAD assigns frame 70 of 100 to recordings without a vehicle
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedRecording:
-    """What `simulate_recording` returns.
+    """Result of `simulate_recording`.
 
     Parameters
     ----------
@@ -157,14 +156,14 @@ class SimulatedRecording:
     sample_rate_hz : float
         Rate of `audio`.
     t0_frame : int
-        First camera frame with line of sight, 10 frames a second from the start; 70 % of all if no vehicle.
+        First camera frame with line of sight, at 10 frames per second; 70 % of the length without a vehicle.
     detections : tuple of tuple of SimulatedDetection
-        One tuple per camera frame; no frame at all for a moving ego, of which OVAD has no detections: vision
-        is unqueried there.
+        One tuple per camera frame; no frames for a moving ego, for which OVAD has no detections: vision is
+        unqueried there.
     truth : dict
         Settings, trajectory, line of sight and azimuth per frame; see `truth.describe`.
     array : MicrophoneArray
-        What listened, in the order of the channels.
+        The array, in the order of the channels.
 
     Examples
     --------
@@ -189,17 +188,17 @@ def simulate_recording(
     """Simulate one recording.
 
     The sound of the vehicle reaches every microphone by mirror images in the walls of both streets, straight
-    or bent round a corner, each after its own travel time; under it lies the ambient field of the site. All
-    levels are absolute, so that the signal-to-noise ratio falls by itself while the vehicle is hidden.
+    or diffracted at a corner, each with its own travel time, above the ambient field of the site. All levels
+    are absolute, so that the signal-to-noise ratio is lower while the vehicle is hidden.
 
     Parameters
     ----------
     settings : SimulationSettings
-        Site, approach and driving.
+        Site, approach and motion.
     rng : numpy.random.Generator
         Source of randomness; the same state gives the same recording.
     array : MicrophoneArray, optional
-        Default `ovad_array`. Its centre stands 1.7 m above the road, whatever heights its positions name.
+        Default `ovad_array`. Its centre is 1.7 m above the road, whatever heights its positions have.
 
     Returns
     -------
@@ -208,7 +207,7 @@ def simulate_recording(
     Raises
     ------
     InvalidArgumentError
-        If a microphone would stand below the road.
+        If a microphone would be below the road.
 
     Examples
     --------
@@ -220,7 +219,7 @@ def simulate_recording(
     """
     to_sound, to_camera = rng.spawn(2)
     array = ovad_array() if array is None else array
-    with threadpool_limits(1):  # the number of BLAS threads would change the last bits
+    with threadpool_limits(1):  # The number of BLAS threads would change the last bits
         audio = _record(settings, array, to_sound)
     camera = PinholeCamera.ovad()
     frames = np.arange(max(round(settings.duration_s * FRAME_RATE_HZ), 1)) / FRAME_RATE_HZ
@@ -238,7 +237,7 @@ def simulate_recording(
 
 
 def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random.Generator) -> Float32Array:
-    """Return what the array records, shape (n, M)."""
+    """Return the recording of the array, shape (n, M)."""
     to_emission, to_street, to_channels = rng.spawn(3)
     positions = standing_m(array)
     skew = settings.preset.delay_mismatch_s * to_channels.standard_normal(len(positions))
@@ -251,7 +250,7 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     street = StreetSound(static, settings.site, settings.preset, receiver)
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
         add_vehicle(street, path, draws)
-    # Generators of their own, and only where something sounds: the rest stays what it is without.
+    # Separate generators, used only if there is a sound, so that the rest does not change.
     for path, vehicle in zip(paths, settings.traffic, strict=True):
         if vehicle.signal:
             add_signal(street, vehicle.signal, path, rng.spawn(1)[0])
@@ -265,24 +264,25 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
 
 
 def _knots(settings: SimulationSettings) -> FloatArray:
-    """Emission knots, from a head start before the recording to its end."""
+    """Return emission knots, from a head start before the recording to its end."""
     knot_s = KNOT_SAMPLES / settings.sample_rate_hz
     before, after = -(-HEAD_START_S // knot_s), -(-settings.duration_s // knot_s)
     return np.arange(-before, after + 1) * knot_s
 
 
 def _to_samples(sound: Float32Array, settings: SimulationSettings, rng: np.random.Generator) -> Float32Array:
-    """From Pa (M, n) to full scale (n, M), with the channels' gains."""
+    """Convert Pa (M, n) to full scale (n, M), with the channels' gains."""
     gain = 10.0 ** (settings.preset.gain_mismatch_db * rng.standard_normal(len(sound)) / 20.0) / FULL_SCALE_PA
     samples = np.empty((round(settings.duration_s * settings.sample_rate_hz), len(sound)), np.float32)
-    for at in range(0, len(samples), SAMPLES_AT_ONCE):  # a transposition at once would not fit any cache
+    # One transposition of everything would not fit into the cache
+    for at in range(0, len(samples), SAMPLES_AT_ONCE):
         some = slice(at, min(at + SAMPLES_AT_ONCE, len(samples)))
         samples[some] = np.clip(sound[:, some] * gain[:, None].astype(np.float32), -1.0, 1.0).T
     return samples
 
 
 def _t0_frame(frames: int, sights: list[BoolArray]) -> int:
-    """First frame in which any vehicle is in line of sight; the last one where none ever is."""
+    """Return the first frame with any vehicle in line of sight; the last frame if there is none."""
     if not sights:
         return min(round(NO_VEHICLE_T0 * frames), frames - 1)
     sight = np.any(sights, axis=0)

@@ -1,1 +1,1 @@
-"""Signals of sounds that are no engine and no tyre, synthesised from their physics."""
+"""Signals of sounds other than engines and tyres, synthesised from their physics."""

@@ -1,6 +1,6 @@
-"""Sounds of a kind at its level: pressure at 1 m, at any sample rate; drawn, or cut out of recordings.
+"""Sounds of a kind at its level: pressure at 1 m, at any sample rate; synthesised or from recordings.
 
-A folder of recordings holds a folder a kind, named as in `SOUNDS`, with WAV or FLAC files of that kind.
+A folder of recordings has one folder per kind, named as in `SOUNDS`, with WAV or FLAC files of that kind.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,26 +33,27 @@ SYNTHESES: dict[str, Synthesis] = {
         *(syntheses.bicycle_bell, syntheses.jackhammer),
     )
 }
-# Everything is drawn at a whole multiple of the rate asked, of at least this, and then band-limited: partials
-# above a low Nyquist frequency are left out, not folded, and the level is that of the whole sound.
+# Everything is synthesised at an integer multiple of the requested rate, at least this one, and then
+# band-limited: partials above a low Nyquist frequency do not alias, and the level is that of the whole sound.
 LOWEST_RATE_HZ = 24_000.0
-LEVEL_FROM_S = 6.0  # a shorter piece is cut out of so long a one: a pause between two words is no shout
+# A shorter piece is cut out of this length, because a pause between two words must not become a shout
+LEVEL_FROM_S = 6.0
 EDGE_S = 0.01
-TRANSITION = 0.05  # of the Nyquist frequency, below it
+TRANSITION = 0.05  # Share of the Nyquist frequency below it
 BLOCK_S, LOUD_DB = 0.125, 10.0
 
 
 SUFFIXES, MOST_FILES = (".wav", ".flac"), 10_000
-# Of a recording so much is read, and its level is that of this part: a stretch between two barks is silent,
-# and shall not be made as loud as a bark.
+# Length that is read of a recording, and to which its level refers: a silent stretch between two barks must
+# not become as loud as a bark.
 READ_S = 60.0
-FINEST = 1000  # Denominator of the ratio of two rates: less than a millionth off
+FINEST = 1000  # Denominator of the ratio of two rates: the error is below a millionth
 
 
 def emitted(
     kind: SoundKind, samples: int, sample_rate_hz: float, rng: np.random.Generator, sounds_folder: str = ""
 ) -> Float32Array:
-    """Draw a sound at its level: pressure in Pa at 1 m in front, in the free field, shape (samples,)."""
+    """Return a sound at its level: pressure in Pa at 1 m in front, in the free field, shape (samples,)."""
     factor = int(np.ceil(LOWEST_RATE_HZ / sample_rate_hz))
     rate, length = factor * sample_rate_hz, samples * factor
     pressure_pa = REFERENCE_PA * 10.0 ** (kind.level_db / 20.0)
@@ -66,13 +67,13 @@ def emitted(
 
 
 def sound_files(folder: str, kind: str) -> list[Path]:
-    """Return the recordings of a kind in a folder of them, in the order of their names."""
+    """Return the recordings of a kind in a folder, in the order of their names."""
     found = Path(folder, kind).glob("*") if folder else ()
     return sorted(path for path in found if path.suffix.lower() in SUFFIXES)
 
 
 def recorded_kinds(folder: str) -> tuple[str, ...]:
-    """Return the kinds that a folder has recordings of; refuse other names, and what cannot be read."""
+    """Return the kinds that a folder contains; refuse other names and unreadable files."""
     kinds = sorted(path.name for path in Path(folder).glob("[!.]*") if path.is_dir())
     for kind in kinds or ["none"]:
         files = sound_files(folder, kind)
@@ -85,7 +86,7 @@ def recorded_kinds(folder: str) -> tuple[str, ...]:
 
 
 def _recorded(files: Sequence[Path], samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Return stretches of recordings one after another until they are long enough, of level one."""
+    """Return stretches of recordings, concatenated to the required length, at unit level."""
     pieces, missing = list[FloatArray](), samples
     while missing > 0:
         sound = _read(files[int(rng.integers(len(files)))], missing, rate_hz, rng)
@@ -96,7 +97,7 @@ def _recorded(files: Sequence[Path], samples: int, rate_hz: float, rng: np.rando
 
 
 def _read(path: Path, samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Return the first channel of a recording or of a part of it, of level one, shape (n,)."""
+    """Return the first channel of a recording, or a part of it, at unit level, shape (n,)."""
     with open_audio(path, strict=False, short=True) as source:
         own_hz = source.sample_rate_hz
         length = min(source.frames, round(max(READ_S, samples / rate_hz + 1.0) * own_hz))
@@ -111,7 +112,7 @@ def _with_edges(piece: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def a_weight(frequency_hz: FloatArray) -> FloatArray:
-    r"""Amplitude of the A-weighting of IEC 61672-1, shape of `frequency_hz`.
+    r"""Return the amplitude of the A-weighting of IEC 61672-1, shape of `frequency_hz`.
 
     .. math:: R_A(f) = \frac{12194^2 f^4}{(f^2 + 20.6^2) \sqrt{(f^2 + 107.7^2)(f^2 + 737.9^2)}
               (f^2 + 12194^2)}, \qquad A(f) = R_A(f) / R_A(1000)
@@ -129,14 +130,14 @@ def a_weighted(signal: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def loud_pressure(signal: FloatArray, rate_hz: float) -> float:
-    """RMS over the eighths of a second that are within 10 dB of the loudest."""
+    """Return the RMS over the eighths of a second within 10 dB of the loudest."""
     block = min(int(BLOCK_S * rate_hz), len(signal))
     power = np.square(signal[: len(signal) // block * block]).reshape(-1, block).mean(axis=1)
     return float(np.sqrt(power[power >= power.max() * 10.0 ** (-LOUD_DB / 10.0)].mean()))
 
 
 def _band_limited(signal: FloatArray, factor: int) -> FloatArray:
-    """Every `factor`-th sample of what lies below the Nyquist frequency that is left."""
+    """Return every `factor`-th sample of the signal below the remaining Nyquist frequency."""
     if factor == 1:
         return signal
     n = len(signal)

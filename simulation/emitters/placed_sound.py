@@ -1,4 +1,4 @@
-"""What a vehicle, its signal or a sound at a place adds to the microphones: paths, scattered, late sound."""
+"""Sound of a vehicle, its signal or a placed source at the microphones: paths, scattering, late field."""
 
 from dataclasses import dataclass, replace
 
@@ -21,17 +21,17 @@ from worldstate.simulation.sound.static_field import PlacedSource, StreetSound, 
 from .emitter import emitted
 from .weather import add_gusts, add_rain, add_wind
 
-# From so many reflections on a vehicle is one point; its parts would cost three times as much. Not from 2 on:
-# whether the second image is lit, on the vehicle's own side, hangs on a metre.
+# From this reflection order on, a vehicle is one point; its parts would cost three times as much. Order 2 is
+# too low: whether the second image on the vehicle's own side is lit depends on a metre.
 POINT_REFLECTIONS = 3
-BASS_BELOW_HZ = 177.0  # between the octaves of 125 and 250 Hz
+BASS_BELOW_HZ = 177.0  # Between the octaves of 125 and 250 Hz
 
 
 def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator) -> None:
-    """Add one vehicle, whose motion is given at the emission knots, to all microphones."""
+    """Add one vehicle to all microphones; its motion is given at the emission knots."""
     static, site, preset, rate = street.static, street.site, street.preset, street.receiver.sample_rate_hz
     level = preset.vehicles_db(site) + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
-    # What the road adds is heard of the tyres alone.
+    # The road surface affects the tyres alone.
     engine_db = preset.engine_spread_db * rng.standard_normal() - site.surface_db + engine_bass_db(preset)
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
     whole = np.sum([one.signal for one in parts], axis=0)
@@ -54,7 +54,7 @@ def _around(street: StreetSound) -> Surroundings:
 
 
 def engine_bass_db(preset: Preset) -> FloatArray:
-    """Level of an engine per octave against CNOSSOS, shape (8, 1).
+    """Return the level of an engine per octave relative to CNOSSOS, shape (8, 1).
 
     Examples
     --------
@@ -64,18 +64,19 @@ def engine_bass_db(preset: Preset) -> FloatArray:
     return np.where(OCTAVES_HZ < BASS_BELOW_HZ, preset.engine_bass_db, 0.0)[:, None]
 
 
-# Silence before and after: the octave bands of a sound that begins at once begin a little earlier.
+# Silence before and after: the octave bands of a sudden sound begin a little earlier than the sound.
 SILENT_BLOCKS = 8
-# Levels of the table are free-field levels, those of a source in `air.ground_gain` stand over hard ground.
+# Levels of the table are free-field levels; those of a source in `air.ground_gain` include hard ground.
 GROUND_GAIN = np.sqrt(2.0)
-# What stands in neither street is heard over the roofs: two storeys high, as near to the array as this.
+# Height and distance of the roofs, two storeys high, over which sounds outside both streets arrive.
 ROOF_HEIGHT_M, ROOF_AWAY_M = 7.0, 4.0
-WEATHER = {"rain": add_rain, "gusts": add_gusts, "wind": add_wind}  # Heard at the microphones, from no place
+# Generated at the microphones, without a position
+WEATHER = {"rain": add_rain, "gusts": add_gusts, "wind": add_wind}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundTrack:
-    """Where a sound is and faces at its emission knots, shape (T,) each."""
+    """Position and facing of a sound at its emission knots, shape (T,) each."""
 
     time_s: FloatArray
     x_m: FloatArray
@@ -84,7 +85,7 @@ class SoundTrack:
 
 
 def add_sound(street: StreetSound, sound: SoundSettings, rng: np.random.Generator) -> None:
-    """Add one sound that is no vehicle's to all microphones."""
+    """Add one sound that does not belong to a vehicle to all microphones."""
     if sound.kind in WEATHER:
         WEATHER[sound.kind](street.static, sound, street.receiver, rng)
         return
@@ -100,7 +101,7 @@ def add_sound(street: StreetSound, sound: SoundSettings, rng: np.random.Generato
 
 
 def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.random.Generator) -> None:
-    """Add what a vehicle warns with, from its front or its rear, all along its path."""
+    """Add the warning signal of a vehicle, from its front or rear, along its path."""
     kind = sound_kind(signal)
     samples = (len(path.time_s) - 1) * KNOT_SAMPLES
     (front_x, front_y), (rear_x, rear_y) = path.behind(0.0), path.behind(path.kind.length_m)
@@ -114,7 +115,7 @@ def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.rando
 def _add_from(
     street: StreetSound, signal: Float32Array, track: SoundTrack, kind: SoundKind, rng: np.random.Generator
 ) -> None:
-    """Add a sound by every way; walls and the late field take its mean over all directions."""
+    """Add a sound by every path; walls and the late field receive its mean over all directions."""
     static, site, receiver = street.static, street.site, street.receiver
     rate, ego_x = receiver.sample_rate_hz, receiver.ego.x_m(track.time_s)
     angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad
@@ -136,7 +137,7 @@ def _add_from(
 
 
 def directivity(kind: SoundKind, angle_rad: FloatArray) -> FloatArray:
-    r"""Amplitude per octave at an angle from where a sound faces, shape (T, 8).
+    r"""Return the amplitude per octave at an angle from the direction that a sound faces, shape (T, 8).
 
     .. math:: g(\theta) = \frac{1 + \cos\theta}{2} + \frac{1 - \cos\theta}{2}\, 10^{D / 20}
     """
@@ -146,13 +147,13 @@ def directivity(kind: SoundKind, angle_rad: FloatArray) -> FloatArray:
 
 
 def mean_gain(kind: SoundKind) -> FloatArray:
-    """RMS of the directivity over all horizontal directions per octave, shape (8,)."""
+    """Return the RMS of the directivity over all horizontal directions per octave, shape (8,)."""
     every = directivity(kind, np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False))
     return np.asarray(np.sqrt(np.square(every).mean(axis=0)))
 
 
 def in_the_streets(site: Site, track: SoundTrack) -> BoolArray:
-    """Tell when a sound stands in the ego's or in the crossing street, or in the open, shape (T,)."""
+    """Return when a sound is in the ego's or the crossing street, or in the open, shape (T,)."""
     x, y = track.x_m, track.y_m
     if site.is_open:
         return np.ones(len(x), np.bool_)
@@ -162,7 +163,7 @@ def in_the_streets(site: Site, track: SoundTrack) -> BoolArray:
 
 
 def over_roofs(track: SoundTrack, height_m: float, receiver: Receiver, cap_db: float) -> FloatArray:
-    """Amplitude that the nearest roof leaves of a straight line per octave, shape (T, 8)."""
+    """Return the amplitude over the nearest roof, relative to a straight line, per octave, shape (T, 8)."""
     _, _, array_z = receiver.centre_m
     away = np.hypot(track.x_m - receiver.ego.x_m(track.time_s), track.y_m)
     beyond, rise = np.maximum(away - ROOF_AWAY_M, 0.0), ROOF_HEIGHT_M - array_z

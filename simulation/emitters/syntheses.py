@@ -1,4 +1,4 @@
-"""Sounds as they are drawn: speech, steps, bells, music, dogs, birds, shots, sirens, horns, tools, tones."""
+"""Synthesis of speech, steps, bells, music, dogs, birds, shots, sirens, horns, tools and tones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,28 +27,28 @@ VOWELS_HZ = (
 )
 HIGHER_HZ = (3500.0, 4500.0)
 BANDWIDTHS_HZ = (80.0, 100.0, 140.0, 200.0, 250.0)
-SPEECH_HZ = (105.0, 215.0)  # men's and women's mean pitch
+SPEECH_HZ = (105.0, 215.0)  # Mean pitch of men and women
 CHILDREN_HZ, MOST_CHILDREN = (230.0, 480.0), 7  # Pitch of calling children (assumed)
-HIGH_VOICE_HZ, SHORT_TRACT = 160.0, 1.15  # a shorter vocal tract has higher formants
-# A syllable takes a quarter of a second: speech is modulated at 3 to 6 Hz most of all.
+HIGH_VOICE_HZ, SHORT_TRACT = 160.0, 1.15  # A shorter vocal tract has higher formants
+# A syllable takes a quarter of a second: the modulation of speech is strongest at 3 to 6 Hz.
 SYLLABLE_S, CLOSURE_S, PHRASE, SPEECH_PAUSE_S = (0.14, 0.24), (0.03, 0.07), (5, 12), (0.25, 0.6)
 SYLLABLE_SPREAD_DB = 2.0
-# The glottal flow falls with 12 dB an octave above its corner and the mouth radiates its derivative.
+# The glottal flow falls with 12 dB per octave above its corner, and the mouth radiates its derivative.
 GLOTTAL_CORNER_HZ = 150.0
 FRICATIVE_SHARE, FRICATIVE_S = 0.5, (0.05, 0.1)
 FRICATIVE_DB, FRICATIVE_GAIN = (-40.0, -40.0, -40.0, -40.0, -12.0, -6.0, 0.0, 0.0), 0.1
-# Octave levels of raised speech, ANSI S3.5-1997, summed from its third octaves; below 100 Hz nothing is said.
-# Five formants alone leave too little above 2 kHz: the higher ones are missing.
+# Octave levels of raised speech, ANSI S3.5-1997, summed from its third octaves; there is no speech below 100
+# Hz. Five formants alone have too little energy above 2 kHz, because the higher ones are missing.
 RAISED_DB = np.array([0.0, 53.0, 60.5, 64.9, 62.7, 57.2, 51.2, 42.5])
 
 
 def voice(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a talker and what is said, shape (samples,)."""
+    """Draw a talker and an utterance, shape (samples,)."""
     return _talker(samples, rate_hz, rng.uniform(*SPEECH_HZ), rng)
 
 
 def children(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw one to seven children who call, and the breath in their voices, shape (samples,)."""
+    """Draw one to seven calling children with breathy voices, shape (samples,)."""
     calls = [
         rng.uniform(0.3, 1.0) * _talker(samples, rate_hz, rng.uniform(*CHILDREN_HZ), rng)
         for _ in range(int(rng.integers(1, MOST_CHILDREN + 1)))
@@ -79,7 +79,7 @@ def _vowels(
     syllables: Spans,
     rng: np.random.Generator,
 ) -> Complex128Array:
-    """Spectrum of the pulse train through a vowel in every syllable, shape (n // 2 + 1,)."""
+    """Return the spectrum of the pulse train through a vowel in every syllable, shape (n // 2 + 1,)."""
     frequency_hz = rfftfreq(n, 1.0 / rate_hz)
     strength = 10.0 ** (SYLLABLE_SPREAD_DB * rng.standard_normal(len(syllables)) / 20.0)
     vowel = rng.integers(len(formants_hz), size=len(syllables))
@@ -96,14 +96,14 @@ def _power(spectrum: Complex128Array) -> float:
 
 
 def _equalised(spectrum: Complex128Array, frequency_hz: FloatArray) -> FloatArray:
-    """Gain that brings the octaves of a talker to those of `RAISED_DB`."""
+    """Return the gain that brings the octaves of a talker to those of `RAISED_DB`."""
     masks = octave_masks(frequency_hz)
     power = np.square(np.abs(spectrum) * masks).sum(axis=1) + np.finfo(float).tiny
     return np.asarray(np.sqrt(10.0 ** (RAISED_DB / 10.0) / power) @ masks)
 
 
 def _syllables(end_s: float, rng: np.random.Generator) -> tuple[list[tuple[float, float]], list[float]]:
-    """Spans of the syllables, and how high each one is in its phrase, which falls."""
+    """Return the spans of the syllables and their relative pitch in the falling phrase."""
     spans, heights, at = [], [], 0.0
     while at < end_s:
         count = int(rng.integers(*PHRASE))
@@ -117,7 +117,7 @@ def _syllables(end_s: float, rng: np.random.Generator) -> tuple[list[tuple[float
 
 
 def _pulses(pitch_hz: FloatArray, rate_hz: float) -> FloatArray:
-    """One impulse a period, between two samples where it falls between them, shape (samples,)."""
+    """Return one impulse per period, interpolated between samples, shape (samples,)."""
     cycles = np.cumsum(pitch_hz) / rate_hz
     at = np.flatnonzero(np.diff(np.floor(cycles)))
     late = np.mod(cycles[at + 1], 1.0) / (pitch_hz[at + 1] / rate_hz)
@@ -128,7 +128,7 @@ def _pulses(pitch_hz: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def _tract(frequency_hz: FloatArray, formants_hz: FloatArray) -> Complex128Array:
-    r"""Glottal flow, vocal tract and radiation: a cascade of resonators of unit gain at 0 Hz.
+    r"""Return glottal flow, vocal tract and radiation: a cascade of resonators of unit gain at 0 Hz.
 
     .. math:: H(f) = \frac{jf}{(1 + jf / f_g)^2} \prod_k \frac{f_k^2}{f_k^2 - f^2 + j f b_k}
     """
@@ -140,13 +140,13 @@ def _tract(frequency_hz: FloatArray, formants_hz: FloatArray) -> Complex128Array
 
 
 def _fricatives(samples: int, rate_hz: float, syllables: Spans, rng: np.random.Generator) -> FloatArray:
-    """Noise of the teeth before some of the syllables, shape (samples,)."""
+    """Return fricative noise before some of the syllables, shape (samples,)."""
     starts = (start for start, _ in syllables if rng.random() < FRICATIVE_SHARE)
     spans = [(start - rng.uniform(*FRICATIVE_S), start) for start in starts]
     return octave_noise(FRICATIVE_DB, samples, rate_hz, rng) * gate(samples, rate_hz, spans, 0.02)
 
 
-# People walk at 1.5 to 2.3 steps a second, 1.9 in the mean (Bachmann and Ammann, "Vibrations in structures
+# People walk at 1.5 to 2.3 steps per second, 1.9 on average (Bachmann and Ammann, "Vibrations in structures
 # induced by man and machines", IABSE, 1987).
 CADENCE_HZ = (1.7, 2.1)
 UNEVEN_S, STEP_UNEVEN_DB = 0.015, 1.5
@@ -158,7 +158,7 @@ CLICK_S, CLICK_GAIN = 0.02, 2000.0
 
 
 def steps(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a walker and what each step sounds like, shape (samples,)."""
+    """Draw a walker and the sound of each step, shape (samples,)."""
     period_s = 1.0 / rng.uniform(*CADENCE_HZ)
     out = np.zeros(samples)
     at = np.arange(rng.uniform(0.0, period_s), samples / rate_hz, period_s)
@@ -172,9 +172,9 @@ def steps(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     return out
 
 
-# Partials of a tuned minor-third bell over its prime: hum, prime, tierce, quint, nominal, twelfth, upper
-# octave; the hum rings longest. A. Lehr, "Partial groups in the bell sound", J. Acoust. Soc. Am. 79 (1986).
-# Ratios are just, strengths and times are assumed.
+# Partials of a tuned minor-third bell relative to its prime: hum, prime, tierce, quint, nominal, twelfth,
+# upper octave; the hum rings longest. A. Lehr, "Partial groups in the bell sound", J. Acoust. Soc. Am. 79
+# (1986). Ratios are just; strengths and times are assumed.
 CHURCH = (
     (0.5, 0.5, 6.0),
     (1.0, 0.6, 3.0),
@@ -192,7 +192,7 @@ CYCLE_HZ, RATTLE_S, RINGS, RINGS_REST_S = (1900.0, 2600.0), 0.09, (3, 7), (0.6, 
 
 
 def bell(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a church bell that swings, shape (samples,)."""
+    """Draw a swinging church bell, shape (samples,)."""
     prime, swing_s = rng.uniform(*PRIME_HZ), rng.uniform(*SWING_S)
     out = np.zeros(samples)
     for at in np.arange(rng.uniform(0.0, 0.5 * swing_s), samples / rate_hz, swing_s).tolist():
@@ -202,7 +202,7 @@ def bell(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 
 def bicycle_bell(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a bicycle bell whose clapper is spun a few times, shape (samples,)."""
+    """Draw a bicycle bell that rings a few times, shape (samples,)."""
     pitch = rng.uniform(*CYCLE_HZ)
     partials = [(pitch * f, a, t) for f, a, t in CYCLE]
     out, at = np.zeros(samples), 0.0
@@ -215,7 +215,7 @@ def bicycle_bell(samples: int, rate_hz: float, rng: np.random.Generator) -> Floa
 
 
 BEATS_PER_MINUTE, TONIC_HZ = (95.0, 130.0), (98.0, 156.0)
-# Semitones over the tonic of four chords: I, V, vi, IV, the commonest loop of popular music.
+# Semitones above the tonic of four chords: I, V, vi, IV, the commonest loop of popular music.
 CHORDS = ((0, 4, 7), (7, 11, 14), (9, 12, 16), (5, 9, 12))
 BEATS_A_CHORD = 4
 KICK = ((55.0, 6.0, 0.12), (110.0, 2.0, 0.05))
@@ -226,7 +226,7 @@ HAT_S, HAT_GAIN = 0.05, 12_000.0
 
 
 def music(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a key and a tempo and play a loop of four chords, shape (samples,)."""
+    """Draw a key and a tempo for a loop of four chords, shape (samples,)."""
     beat_s, tonic = 60.0 / rng.uniform(*BEATS_PER_MINUTE), rng.uniform(*TONIC_HZ)
     time = np.arange(samples) / rate_hz
     chord = (time / (BEATS_A_CHORD * beat_s)).astype(int) % len(CHORDS)
@@ -243,18 +243,18 @@ def music(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 
 def _semitones(chord: np.ndarray[tuple[int], np.dtype[np.int64]], note: int) -> FloatArray:
-    """Frequency ratio of one note of the chord at every sample."""
+    """Return the frequency ratio of one note of the chord at every sample."""
     return np.asarray(2.0 ** (np.array(CHORDS)[chord, note] / 12.0))
 
 
-# Notes of a major scale over a tonic, how long they are and how they decay (assumed): any instrument.
+# Notes of a major scale above a tonic, their lengths and decays (assumed), for any instrument.
 SCALE, TUNE_TONIC_HZ = (0, 2, 4, 5, 7, 9, 11, 12), (150.0, 700.0)
 NOTE_S, NOTE_DECAY_S = (0.12, 0.8), (0.3, 3.0)
 VIBRATO, VIBRATO_HZ, MOST_PARTS = 0.006, 5.5, 4
 
 
 def tune(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw up to four instruments that each play notes of a scale of its own, shape (samples,)."""
+    """Draw up to four instruments that each play notes of their own scale, shape (samples,)."""
     out = np.zeros(samples)
     for _ in range(int(rng.integers(1, MOST_PARTS + 1))):
         tonic, note_s, decay_s = rng.uniform(*TUNE_TONIC_HZ), rng.uniform(*NOTE_S), rng.uniform(*NOTE_DECAY_S)
@@ -277,7 +277,7 @@ BEAT_S, HISS_SHARE, HISS_S = (0.2, 0.75), 0.6, (0.01, 0.08)
 
 
 def drums(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a beat and what is struck on it, shape (samples,)."""
+    """Draw a beat and its drums, shape (samples,)."""
     out, beat_s = np.zeros(samples), rng.uniform(*BEAT_S)
     for at in np.arange(rng.uniform(0.0, beat_s), samples / rate_hz, beat_s).tolist():
         add_ringing(out, at, rate_hz, DRUMS[rng.integers(len(DRUMS))], rng.uniform(0.3, 1.0))
@@ -308,13 +308,13 @@ def dog(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     return out
 
 
-# A shot is a blast and what the place sends back of it; bursts come at an even pace (assumed).
+# A shot is a blast and the echo of the place; bursts have an even pace (assumed).
 BLAST_DECAY_S, ECHO, ECHO_S = (0.005, 0.06), (0.02, 0.25), (0.1, 0.7)
 BURST_S, SINGLE_S = (0.08, 0.6), (0.8, 4.0)
 
 
 def shots(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw shots one by one or in bursts, shape (samples,)."""
+    """Draw single shots or bursts, shape (samples,)."""
     out, at, pace_s = np.zeros(samples), rng.uniform(0.1, 2.0), rng.uniform(*BURST_S)
     in_bursts = rng.random() < 0.5
     while at < samples / rate_hz:
@@ -325,12 +325,12 @@ def shots(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 
 def _falling(slope: float, count: int) -> list[float]:
-    """Amplitudes of partials that fall by a power of their order."""
+    """Return amplitudes of partials that fall by a power of their order."""
     return [order**-slope for order in range(1, count + 1)]
 
 
 def _times(out: FloatArray, at_s: float, length_s: float, rate_hz: float) -> FloatArray:
-    """Return times since `at_s` of so long a note, of which the end of the sound may cut some."""
+    """Return the times since `at_s` of a note, cut at the end of the sound."""
     return np.arange(max(min(int(length_s * rate_hz), len(out) - int(at_s * rate_hz)), 0)) / rate_hz
 
 
@@ -346,7 +346,7 @@ def _add_blast(
     parts: Sequence[tuple[float, float]],
     rng: np.random.Generator,
 ) -> None:
-    """Add white noise that decays: parts are an amplitude and a time constant in s."""
+    """Add decaying white noise: parts are an amplitude and a time constant in s."""
     time = _times(out, at_s, INAUDIBLE_DECAYS * max(decay_s for _, decay_s in parts), rate_hz)
     envelope = np.sum([amplitude * np.exp(-time / decay_s) for amplitude, decay_s in parts], axis=0)
     _add(out, at_s, rate_hz, envelope * rng.standard_normal(len(time)))
@@ -354,7 +354,7 @@ def _add_blast(
 
 @dataclass(frozen=True, slots=True)
 class _Song:
-    """Notes of a phrase (start and end in Hz, length in s), how often they come, and the rest after it."""
+    """Notes of a phrase (start and end in Hz, length in s), their number, and the rest after it."""
 
     notes: tuple[tuple[float, float, float], ...]
     repeats: tuple[int, int]
@@ -373,7 +373,7 @@ TRANSPOSE = (0.95, 1.1)
 
 
 def birds(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw phrases of several birds one after the other, shape (samples,)."""
+    """Draw consecutive phrases of several birds, shape (samples,)."""
     out, at = np.zeros(samples), rng.uniform(0.0, 0.5)
     while at < samples / rate_hz:
         song, pitch = SONGS[rng.integers(len(SONGS))], rng.uniform(*TRANSPOSE)
@@ -395,17 +395,17 @@ def _add_note(out: FloatArray, at_s: float, rate_hz: float, note: tuple[float, f
         out[first : first + count] += envelope * harmonics(glide, WHISTLE_OVERTONES, rate_hz)
 
 
-# The German emergency horn in town: 410 and 547 Hz, a fourth apart as DIN 14610 asks. How long each tone
-# lasts is assumed. Its compressed-air horns carry their energy above 1 kHz: DIN 14610's technical rules ask
-# for a harmonic of 104 dB there.
+# The German emergency horn in town: 410 and 547 Hz, a fourth apart as DIN 14610 requires; the length of each
+# tone is assumed. Its compressed-air horns have most energy above 1 kHz: the technical rules of DIN 14610
+# require a harmonic of 104 dB there.
 TWO_TONES_HZ, TONE_S, GLIDE_S = (410.0, 547.0), 0.75, 0.03
-# The signs give the lowest peak, 4 dB over the rms where partials in step have 10: those are trains of clicks
-# and clip at the microphones long before a tone does.
+# These signs give the lowest peak, 4 dB above the rms; partials in phase have 10 dB, which are trains of
+# clicks that clip at the microphones long before a tone does.
 HORN_PARTIALS = (0.5, 0.7, -1.0, 1.0, 0.9, 0.7, 0.5, -0.35, -0.25, -0.18, 0.12, 0.08)
-# An electronic siren's wail: 10 to 30 cycles a minute (13 CCR 1028); its span is assumed.
+# Wail of an electronic siren: 10 to 30 cycles per minute (13 CCR 1028); its span is assumed.
 WAIL_HZ, WAILS_HZ = (600.0, 1400.0), (0.2, 0.35)
-WAIL_PARTIALS = (1.0, 0.1, 0.35, 0.05, 0.2, 0.03, 0.1)  # nearly a square wave
-# Two discs a third apart (assumed); UN Regulation No. 28 asks for 1.8 to 3.55 kHz to be the loudest part.
+WAIL_PARTIALS = (1.0, 0.1, 0.35, 0.05, 0.2, 0.03, 0.1)  # Nearly a square wave
+# Two discs a third apart (assumed); UN Regulation No. 28 requires that 1.8 to 3.55 kHz is the loudest part.
 DISCS_HZ, DISC_SPREAD = (420.0, 505.0), 0.05
 DISC_PARTIALS = (0.3, 0.3, 0.4, -0.6, -0.9, -1.0, 0.9, -0.7, -0.4, 0.25, -0.15, 0.1)
 BLAST_S, PAUSE_S = (0.3, 1.2), (0.4, 2.0)
@@ -415,7 +415,7 @@ BEEP_PARTIALS = (1.0, 0.05, 0.1)
 
 
 def siren(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Two tones in turn, shape (samples,)."""
+    """Draw two alternating tones, shape (samples,)."""
     time = np.arange(samples) / rate_hz + rng.uniform(0.0, 2.0 * TONE_S)
     turn = np.mod(time, 2.0 * TONE_S)
     rising = np.clip(turn / GLIDE_S, 0.0, 1.0)
@@ -425,32 +425,32 @@ def siren(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 
 def wail(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """One tone that rises and falls, shape (samples,)."""
+    """Draw one tone that rises and falls, shape (samples,)."""
     low, high = WAIL_HZ
     cycles = rng.random() + rng.uniform(*WAILS_HZ) * np.arange(samples) / rate_hz
     return harmonics(low * (high / low) ** (0.5 - 0.5 * np.cos(2.0 * np.pi * cycles)), WAIL_PARTIALS, rate_hz)
 
 
 def horn(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Blasts of a pair of disc horns, shape (samples,)."""
+    """Draw blasts of a pair of disc horns, shape (samples,)."""
     tune = rng.uniform(1.0 - DISC_SPREAD, 1.0 + DISC_SPREAD)
     blasts = gate(samples, rate_hz, bursts(samples / rate_hz, BLAST_S, PAUSE_S, rng), 0.02)
     both = [harmonics(np.full(samples, tune * disc), DISC_PARTIALS, rate_hz) for disc in DISCS_HZ]
     return blasts * (both[0] + both[1])
 
 
-# What sirens and horns have in common wherever they are made: harmonics of one pitch that sweeps, of two that
-# take turns, or of one or two that are held (spans assumed, wider than any regulation).
+# Common features of sirens and horns of any make: harmonics of one sweeping pitch, of two alternating
+# pitches, or of one or two steady ones (spans assumed, wider than any regulation).
 SWEEP_LOW_HZ, SWEEP_RATIO, SWEEPS_HZ = (350.0, 900.0), (1.3, 2.6), (0.1, 8.0)
 TURN_LOW_HZ, TURN_RATIO, TURN_S, TURN_GLIDE_S = (350.0, 800.0), (1.15, 1.6), (0.25, 1.0), 0.02
 HELD_HZ, HELD_S, HELD_PAUSE_S = (250.0, 650.0), (0.3, 8.0), (0.1, 2.0)
-# A diaphragm is rough: held to the modulation of 24 real horns above 6 Hz, which even tones lack.
+# Roughness of a diaphragm, fitted to the modulation of 24 real horns above 6 Hz, which steady tones lack.
 DIAPHRAGM, DIAPHRAGM_S, HORN_FALLS = (0.0, 0.6), (0.01, 0.06), (0.0, 0.8)
 SECOND_RATIO, SECOND_SHARE = (1.15, 1.35), 0.7
 
 
 def sweeps(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a siren that rises and falls at any pace, round or straight, shape (samples,)."""
+    """Draw a siren that rises and falls at any pace, smoothly or linearly, shape (samples,)."""
     low, ratio = rng.uniform(*SWEEP_LOW_HZ), rng.uniform(*SWEEP_RATIO)
     pace_hz = np.exp(rng.uniform(*np.log(SWEEPS_HZ)))
     cycles = rng.random() + pace_hz * np.arange(samples) / rate_hz
@@ -460,7 +460,7 @@ def sweeps(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray
 
 
 def turns(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a siren of any two tones in turn, shape (samples,)."""
+    """Draw a siren of any two alternating tones, shape (samples,)."""
     low, ratio, tone_s = rng.uniform(*TURN_LOW_HZ), rng.uniform(*TURN_RATIO), rng.uniform(*TURN_S)
     cycles = np.mod((np.arange(samples) / rate_hz + rng.uniform(0.0, 2.0 * tone_s)) / tone_s, 2.0)
     height = np.clip(0.5 + (np.abs(cycles - 1.0) - 0.5) * tone_s / TURN_GLIDE_S, 0.0, 1.0)
@@ -468,7 +468,7 @@ def turns(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 
 def horns(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw blasts of one horn or two of any pitch, shape (samples,)."""
+    """Draw blasts of one or two horns of any pitch, shape (samples,)."""
     pitches = [rng.uniform(*HELD_HZ)]
     if rng.random() < SECOND_SHARE:
         pitches.append(pitches[0] * rng.uniform(*SECOND_RATIO))
@@ -482,26 +482,26 @@ def horns(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 
 def beeper(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """One tone, on and off, shape (samples,)."""
+    """Draw an intermittent tone, shape (samples,)."""
     period_s = 1.0 / rng.uniform(*BEEPS_HZ)
     starts = np.arange(0.0, samples / rate_hz, period_s)
     beeps = gate(samples, rate_hz, [(at, at + 0.5 * period_s) for at in starts.tolist()], 0.01)
     return beeps * harmonics(np.full(samples, rng.uniform(*BEEP_HZ)), BEEP_PARTIALS, rate_hz)
 
 
-# Hammer drills give 25 to 80 blows a second, breakers 9 to 30 (makers' data; the envelopes of seven real
-# breakers 9 to 21), not quite evenly, and fewer under load. Each blow excites modes of bit, body and ground,
-# which ring for some cycles, and a burst of noise; between blows motor or air are heard. Held to the numbers
-# of real drilling and jackhammers (docs/evidence/foreign_sounds.md).
+# Hammer drills strike 25 to 80 times per second, breakers 9 to 30 times (manufacturers' data; the envelopes
+# of seven real breakers 9 to 21), not quite evenly, and slower under load. Each blow excites modes of bit,
+# body and ground, which ring for some cycles, and a burst of noise; between blows motor or air are audible.
+# Fitted to the features of real drilling and jackhammers (docs/evidence/foreign_sounds.md).
 DRILL_BLOWS_HZ, BREAKER_BLOWS_HZ = (25.0, 80.0), (9.0, 30.0)
 UNEVEN_BLOWS, BLOW_SPREAD_DB, BLOW_DRIFT = (0.002, 0.03), (0.5, 3.0), (0.01, 0.08)
 MODES, MODE_HZ, MODE_CYCLES, LONGEST_MODE_S = (3, 10), (120.0, 5000.0), (2.0, 15.0), 0.04
 IMPACT_S, IMPACT, BETWEEN, MOTOR = (0.003, 0.03), (0.1, 2.0), (0.05, 1.0), (0.3, 2.5)
 BLOW_DB = (-8.0, -5.0, -3.0, 0.0, 0.0, -2.0, -5.0, -8.0)
 DRILLED_S, BROKEN_S, REST_S = (0.4, 5.0), (3.0, 15.0), (0.2, 2.0)
-# Circular saws, grinders, drills without blows: a motor or a blade of 50 to 500 turns a second, with teeth or
-# gears that whine up to 5 kHz (makers' data: 24 or 40 teeth at 55 to 75 turns, a motor's 100 to 500); it runs
-# up, slows down under its load, and runs out.
+# Circular saws, grinders, drills without blows: a motor or a blade of 50 to 500 turns per second, with teeth
+# or gears that whine up to 5 kHz (manufacturers' data: 24 or 40 teeth at 55 to 75 turns, a motor's 100 to
+# 500). It runs up, slows down under load, and runs out.
 MOTOR_HZ, GEARS_HZ, RUN_S = (50.0, 500.0), (50.0, 5000.0), (0.05, 0.8)
 LOAD_S, LOADED_S, MOST_SAG, LOADED_DB = (0.2, 2.0), (0.1, 1.5), 0.35, (0.0, 12.0)
 GRIND_DB = (-25.0, -20.0, -15.0, -10.0, -4.0, 0.0, 2.0, 0.0)
@@ -509,21 +509,21 @@ WHINE, GRIND, CHATTER_HZ, CHATTER_DB = (0.4, 2.5), (0.05, 1.0), (8.0, 80.0), (0.
 
 
 def drill(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a hammer drill that bores hole after hole, shape (samples,)."""
+    """Draw a hammer drill that drills several holes, shape (samples,)."""
     runs = bursts(samples / rate_hz, DRILLED_S, REST_S, rng)
     motor = motor_sound(gate(samples, rate_hz, runs, 0.1), rate_hz, rng)
     return hammered(samples, rate_hz, runs, DRILL_BLOWS_HZ, rng) + rng.uniform(*MOTOR) * motor
 
 
 def jackhammer(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a breaker that breaks up a road, shape (samples,)."""
+    """Draw a road breaker, shape (samples,)."""
     return hammered(samples, rate_hz, bursts(samples / rate_hz, BROKEN_S, REST_S, rng), BREAKER_BLOWS_HZ, rng)
 
 
 def hammered(
     samples: int, rate_hz: float, runs: Spans, blows_hz: tuple[float, float], rng: np.random.Generator
 ) -> FloatArray:
-    """Blows while it runs, what each excites, and air between them, shape (samples,)."""
+    """Draw blows while the tool runs, their excited modes, and air between them, shape (samples,)."""
     running, pace_hz = gate(samples, rate_hz, runs, 0.1), np.exp(rng.uniform(*np.log(blows_hz)))
     cycles = np.cumsum(pace_hz * (1.0 + rng.uniform(*BLOW_DRIFT) * drift(samples, rate_hz, 0.4, rng)))
     at = np.flatnonzero(np.diff(np.floor(cycles / rate_hz)))
@@ -550,7 +550,7 @@ def saw(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
 
 
 def motor_sound(running: FloatArray, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Motor, gears and what is ground, at a speed 0..1 that sags under load, of power one."""
+    """Draw motor, gears and grinding at a speed 0..1 that drops under load, of unit power."""
     samples = len(running)
     load = gate(samples, rate_hz, bursts(samples / rate_hz, LOAD_S, LOADED_S, rng), 0.2)
     speed = running * (1.0 - rng.uniform(0.0, MOST_SAG) * load)
@@ -569,14 +569,14 @@ def _unit(signal: FloatArray) -> FloatArray:
     return np.asarray(signal / (signal.std() + np.finfo(float).tiny))
 
 
-# Pitches from the hum of a transformer to a whistle; how many overtones and how strong is assumed.
+# Pitches from the hum of a transformer to a whistle; number and strength of overtones are assumed.
 PITCH_HZ, OVERTONES, STRONGEST = (120.0, 2200.0), (0, 5), 0.6
 UNSTEADY = 0.002
 OFF_SHARE, ON_S, OFF_S = 0.3, (0.5, 3.0), (0.3, 1.5)
 
 
 def tone(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a pitch with its overtones and hold it, shape (samples,)."""
+    """Draw a steady pitch with overtones, shape (samples,)."""
     pitch = np.exp(rng.uniform(*np.log(PITCH_HZ))) * (1.0 + UNSTEADY * drift(samples, rate_hz, 0.5, rng))
     falls, count = rng.uniform(0.0, STRONGEST), int(rng.integers(*OVERTONES))
     out = harmonics(pitch, [falls**k for k in range(1 + count)], rate_hz)

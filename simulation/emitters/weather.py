@@ -1,4 +1,4 @@
-"""Weather at the microphones: rain round each of them and from the whole street, gusts and wind."""
+"""Weather at the microphones: rain near each of them and from the whole street, gusts and wind."""
 
 from functools import cache
 
@@ -27,17 +27,18 @@ from worldstate.simulation.sound.static_field import (
 from .emitter import a_weight, a_weighted
 from .signals import add_ringing, bursts, gate, octave_noise
 
-# Drops that hit the sheet metal within a hand's breadth of a microphone (assumed: moderate rain, 4 mm/h), the
-# damped modes each of them excites, and how much louder the largest are: masses spread like an exponential.
+# Drops per second on the sheet metal within a hand's breadth of a microphone (assumed: moderate rain, 4
+# mm/h), the damped modes that each excites, and the level of the largest: masses have an exponential
+# distribution.
 DROPS_HZ = 40.0
 MODES = ((700.0, 1.0, 0.006), (1600.0, 0.8, 0.004), (3300.0, 0.6, 0.0025), (5800.0, 0.3, 0.0015))
-# Rain on paving hisses from 1 kHz up (assumed); it comes from all around and from somewhat above.
+# Rain on paving has energy from 1 kHz up (assumed); it arrives from all azimuths and somewhat from above.
 FAR_DB = (-20.0, -16.0, -12.0, -8.0, -4.0, 0.0, 2.0, 2.0)
 FAR_WAVES, FAR_LIFT_RAD = 24, 0.3
-FAR_SHARE = 0.3  # of the energy at a microphone
-# Levels are those of the whole sound: a low sample rate hears less of it.
+FAR_SHARE = 0.3  # Share of the energy at a microphone
+# Levels are those of the whole sound: at a low sample rate a part of it is missing.
 WHOLE_HZ = np.arange(1.0, 20_000.0, 5.0)
-SHOWER_RAMP_S = 0.5  # a shower sets in
+SHOWER_RAMP_S = 0.5  # Time in which a shower starts
 
 
 def add_rain(
@@ -60,27 +61,27 @@ def add_rain(
 
 
 def _drop(rate_hz: float) -> FloatArray:
-    """Sound of one drop of unit strength, of what a sample rate can hold."""
+    """Return the sound of one drop of unit strength within the band of a sample rate."""
     out = np.zeros(int(0.04 * rate_hz))
     add_ringing(out, 0.0, rate_hz, MODES)
     return out
 
 
 def _drumming(samples: int, rate_hz: float, rng: np.random.Generator) -> Float32Array:
-    """Draw drops at random times and of random strengths, of unit A-weighted pressure in the mean."""
+    """Draw drops at random times and of random strengths, of unit mean A-weighted pressure."""
     hits, drop = np.zeros(samples), _drop(rate_hz)
     count = int(rng.poisson(DROPS_HZ * samples / rate_hz))
     np.add.at(hits, rng.integers(samples, size=count), rng.exponential(1.0, count))
     n = next_fast_len(samples + len(drop), real=True)
     heard = irfft(rfft(hits, n) * rfft(drop, n), n)[:samples]
-    # Campbell's theorem: the power of a shot noise is its rate times the energy of one shot, times the mean
-    # square of the strengths, which is 2 of an exponential of mean 1.
+    # Campbell's theorem: the power of shot noise is its rate times the energy of one shot, times the mean
+    # square of the strengths, which is 2 for an exponential of mean 1.
     return np.asarray(heard / np.sqrt(2.0 * DROPS_HZ * _drop_energy()), np.float32)
 
 
 @cache
 def _drop_energy() -> float:
-    """A-weighted energy of a drop of unit strength, Pa^2 s."""
+    """Return the A-weighted energy of a drop of unit strength, Pa^2 s."""
     rate = 2.0 * WHOLE_HZ[-1]
     whole = a_weighted(np.pad(_drop(rate), 2048), rate)
     return float(np.square(whole).sum() / rate)
@@ -88,7 +89,7 @@ def _drop_energy() -> float:
 
 @cache
 def _hiss_pressure() -> float:
-    """A-weighted pressure of a wave of the levels `FAR_DB`, Pa."""
+    """Return the A-weighted pressure of a wave of the levels `FAR_DB`, Pa."""
     density = level_curve(np.array(FAR_DB), WHOLE_HZ) * a_weight(WHOLE_HZ) ** 2
     return float(np.sqrt(np.trapezoid(density, WHOLE_HZ)))
 
@@ -99,7 +100,7 @@ GUST_S, LULL_S, GUST_RAMP_S = (0.5, 2.5), (0.3, 2.0), 0.2
 def add_gusts(
     static: StaticSources, sound: SoundSettings, receiver: Receiver, rng: np.random.Generator
 ) -> None:
-    """Add gusts to the microphones that they hit, to each of them by itself."""
+    """Add independent gusts to the microphones that they hit."""
     if max(sound.channels) >= len(static.out) or min(sound.channels) < 0:
         problem = f"expected 0 to {len(static.out) - 1}, got {sound.channels}"
         raise InvalidArgumentError(f"channels of gusts: {problem}")
@@ -117,12 +118,12 @@ def add_gusts(
 def add_wind(
     static: StaticSources, sound: SoundSettings, receiver: Receiver, rng: np.random.Generator
 ) -> None:
-    """Add one swell of wind to all microphones at once; the noise of each differs from that of the others."""
+    """Add one swell of wind to all microphones at once; its noise is independent at each."""
     rate, samples = receiver.sample_rate_hz, static.out.shape[1]
     level_db = sound.what.level_db + sound.level_offset_db
     density = wind_density(level_db, noise_frequencies(samples, rate), ROOF_SLOPE, ROOF_FLOOR_HZ) * rate
     begin = sound.start_s - receiver.knots_s[0]
-    # It swells for half of its time and then dies away.
+    # It rises for half of its time and falls for the other half.
     swell = gate(samples, rate, [(begin, begin + sound.duration_s)], sound.duration_s).astype(np.float32)
     for channel, draws in zip(static.out, rng.spawn(len(static.out)), strict=True):
         channel += swell * shaped_noise(density, samples, draws)

@@ -1,1 +1,1 @@
-"""Continuous streams of any length: traffic as arrivals, sound block by block, truth per vehicle."""
+"""Continuous streams of any length: traffic as arrivals, sound in blocks, truth per vehicle."""

@@ -1,4 +1,4 @@
-"""Arrivals: every flow is a Poisson process, every arrival one vehicle or several."""
+"""Arrivals: every flow is a Poisson process, and every arrival is one vehicle or several."""
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
@@ -19,21 +19,21 @@ from worldstate.simulation.scene.vehicle import EgoMotion
 from .manoeuvres import EARSHOT_M, LEFT, MANOEUVRES, RIGHT, Manoeuvre, behind, draw_driver
 from .settings import HAZARDS, StreamSettings, Traffic
 
-TOGETHER_S = 0.7  # standard deviation between two that come from both sides at once
+TOGETHER_S = 0.7  # Standard deviation of the time between two vehicles that come from both sides at once
 LONGEST_QUEUE, FAR = 8, ("far", "distant")
-AROUND_DRIVE_S = 20.0  # a vehicle that arrives so long before or after a drive is still heard in it
+AROUND_DRIVE_S = 20.0  # A vehicle that arrives this long before or after a drive is still audible in it
 STANDING = EgoMotion()
-SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # the fades of an event lie beside the sound
+SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # The fades of an event are outside the sound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VehicleEvent:
     """One vehicle of a stream."""
 
-    flow: str  # The flow that it arrived in, or "follows"
+    flow: str  # Its flow, or "follows"
     manoeuvre: Manoeuvre
     start_s: float  # Time of the stream at which the clock of its motion is 0
-    signal: str = ""  # What it warns with
+    signal: str = ""  # Its warning signal
 
     @property
     def end_s(self) -> float:
@@ -43,19 +43,19 @@ class VehicleEvent:
 
 @dataclass(frozen=True, slots=True)
 class SoundEvent:
-    """A sound of a stream that is no vehicle's."""
+    """A sound of a stream that does not belong to a vehicle."""
 
     sound: SoundSettings
     start_s: float  # Time of the stream at which its clock is 0
-    gusty: tuple[tuple[int, ...], ...] = ()  # Of gusts: the channels that they hit of each array
+    gusty: tuple[tuple[int, ...], ...] = ()  # For gusts: the channels that they hit in each array
 
     @property
     def end_s(self) -> float:
-        """Time of the stream at which it is over, with what comes late."""
+        """Time of the stream at which it is over, its late sound included."""
         return self.start_s + self.sound.end_s + SOUND_MARGIN_S
 
     def at(self, array: int) -> "SoundEvent":
-        """Return it as it is at one of the arrays."""
+        """Return it at one of the arrays."""
         if not self.gusty:
             return self
         return replace(self, sound=replace(self.sound, channels=self.gusty[array]))
@@ -67,7 +67,7 @@ Event = VehicleEvent | SoundEvent
 def draw_events(settings: StreamSettings, rng: np.random.Generator) -> list[VehicleEvent]:
     """Draw all vehicles of a stream, in the order in which they come into earshot."""
     traffic, duration_s = settings.traffic, settings.duration_s
-    # A generator a flow: another rate of one of them leaves the others as they are.
+    # One generator per flow: another rate of one flow does not change the others.
     flows = dict(zip(MANOEUVRES, rng.spawn(len(MANOEUVRES)), strict=True))
     turns = _turns(settings, rng) if traffic.evenly else {}
     around_s = 0.0 if settings.ego.stands else AROUND_DRIVE_S
@@ -85,9 +85,9 @@ def draw_events(settings: StreamSettings, rng: np.random.Generator) -> list[Vehi
 
 
 def _turns(settings: StreamSettings, rng: np.random.Generator) -> dict[str, FloatArray]:
-    """Deal equal stretches of time to the hazards, and draw the middle half of each to arrive in.
+    """Assign equal stretches of time to the hazards, and draw each arrival in the middle half of its own.
 
-    A drive has one of them, shortly before the ego stops, as recordings have.
+    A drive has one hazard, shortly before the ego stops, like a recording.
     """
     per_hour, ego = settings.traffic.per_hour, settings.ego
     if not ego.stands:
@@ -111,12 +111,12 @@ def _arrival(
     names, shares = zip(*traffic.kinds.items(), strict=True)
     for arm in arms.get(flow, (None,)):
         kind = vehicle_kind(str(rng.choice(names, p=np.array(shares) / sum(shares))))
-        # A bicycle two streets away is not heard.
+        # A bicycle two streets away is inaudible.
         heard = vehicle_kind("light") if flow in FAR and kind.name == "bicycle" else kind
         driver = draw_driver(settings.site, heard, preset, rng, arm)
         signal = _signal(traffic, heard, rng)
         if signal:
-            driver = replace(driver, reach_m=EARSHOT_M[1])  # louder than its tyres
+            driver = replace(driver, reach_m=EARSHOT_M[1])  # Louder than its tyres
         leader = MANOEUVRES[flow](driver, rng)
         late_s = _later(traffic, rng) if flow == "both" and arm == RIGHT else 0.0
         yield replace(_event(flow, arrival_s + late_s, leader), signal=signal)
@@ -127,14 +127,14 @@ def _arrival(
             another = number == 0 if flow == "queue" else rng.random() < traffic.follower_share
             if not another:
                 break
-            # A follower on a bicycle would not keep up: it is a vehicle of the leader's kind or a car.
+            # A bicycle could not follow, so the follower is of the leader's kind or a car.
             kind = leader.motion.kind if rng.random() < 0.5 else vehicle_kind("light")
             last = behind(last, rng.uniform(*traffic.headway_s), kind)
             yield _event("follows", arrival_s + late_s, last)
 
 
 def _later(traffic: Traffic, rng: np.random.Generator) -> float:
-    """Draw how much later the one from the right comes, seconds."""
+    """Draw the delay of the vehicle from the right, seconds."""
     if traffic.apart_s is None:
         return TOGETHER_S * float(rng.standard_normal())
     return float(rng.uniform(-traffic.apart_s, traffic.apart_s))
@@ -143,7 +143,7 @@ def _later(traffic: Traffic, rng: np.random.Generator) -> float:
 def draw_sounds(
     settings: StreamSettings, arrays: Sequence[int], rng: np.random.Generator
 ) -> list[SoundEvent]:
-    """Draw all sounds of a stream that are no vehicle's, each kind a Poisson process of its own.
+    """Draw all sounds of a stream that do not belong to vehicles; each kind is a Poisson process.
 
     `arrays` are numbers of microphones.
     """
@@ -154,7 +154,7 @@ def draw_sounds(
             lasts_s, preset = own.uniform(*SOUND_S), settings.drawn_preset
             empty = SimulationSettings(settings.site, "none", duration_s=lasts_s, preset=preset)
             gusts = kind == "gusts"
-            # Gusts draw more or less by the number of microphones: what is drawn next must not depend on it.
+            # The number of draws for gusts depends on the number of microphones; the next draws must not.
             draws = [deepcopy(one) for one in own.spawn(1) * len(arrays)] if gusts else [own]
             at = [
                 with_sounds(empty, [kind], microphones, one).sounds[0]
@@ -170,7 +170,7 @@ def _event(flow: str, arrival_s: float, manoeuvre: Manoeuvre) -> VehicleEvent:
 
 
 def _signal(traffic: Traffic, kind: VehicleKind, rng: np.random.Generator) -> str:
-    """Draw what a vehicle warns with; only what is ridden has a bicycle's bell."""
+    """Draw the warning signal of a vehicle; only ridden vehicles have a bicycle's bell."""
     for signal, share in traffic.signals.items():
         if (signal == "bicycle-bell") == (kind.ridden_mps is not None) and rng.random() < share:
             return signal

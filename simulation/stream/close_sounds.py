@@ -1,9 +1,9 @@
-"""Sounds some metres away, as recorders of any make hear them: close passes, idling engines, single sounds.
+"""Sounds at some metres, recorded by devices of any make: close passes, idling engines, single sounds.
 
-Streets are rendered at junctions. What hears with one microphone has to hold for other places and recorders,
-too: here a vehicle passes or idles in the open, any other sound stands in a yard or a room, both over noise
-of a drawn colour and through a drawn frequency response. Fluctuations, tones and their spread are held to
-those of real recordings (docs/evidence/foreign_sounds.md).
+Streets are rendered at junctions. A model that reads one microphone must also hold at other places and for
+other recorders. Here a vehicle passes or idles in the open, and any other sound is in a yard or a room, over
+noise of a drawn spectrum and through a drawn frequency response. Fluctuations, tones and their spread are
+fitted to those of real recordings (docs/evidence/foreign_sounds.md).
 """
 
 from dataclasses import replace
@@ -32,12 +32,12 @@ DISTANCES_M, HEIGHTS_M = (2.0, 12.0), (1.0, 2.0)
 SPEEDS_MPS, ACCELERATIONS_MPS2 = (5.0, 16.0), (0, 0, 0, 1.2, -1.5)
 RIDDEN_MPS2 = (0, 0, 1.2, 2.5, 4.0, -2.0, -4.0)  # Motorcycles are driven harder
 FAR_M = 300.0
-# Spread of single vehicles about their kind, and of recorders and ambience; dB, by octave.
+# Spread of single vehicles within a kind, and of recorders and ambience; dB, by octave.
 _VEHICLE_DB, _RECORDER_DB, _MOST_DB, _TILT_DB, _CUTS_HZ = 4.0, 3.0, 6.0, 1.0, (30.0, 150.0)
-_MOTORCYCLE_DB = 7.0  # Exhausts differ more
+_MOTORCYCLE_DB = 7.0  # Exhausts vary more
 _NOISE_SLOPES_DB, _SWELL_DB = (-7.0, -2.0), (0.0, 2.0)
-# How a level fluctuates: knots every so many seconds, dB, whether of all octaves together. Without it the 49
-# numbers of simulated cars lay .14 (median of |AUROC - .5|) off those of real ones, with it .08.
+# Fluctuation of a level: interval of the knots in seconds, dB, whether common to all octaves. Without it the
+# 49 features of simulated cars had a median |AUROC - 0.5| of 0.14 against real ones, with it 0.08.
 _FLUCTUATIONS = (
     (0.35, 1.1, True),
     (0.05, 0.5, True),
@@ -45,11 +45,11 @@ _FLUCTUATIONS = (
     (0.3, 1.1, False),
     (0.03, 1.2, False),
 )
-_STEADIER = 0.8  # Of an engine that idles
-# Firing of an engine that idles, Hz; how far the level follows it, dB, and how sharply.
+_STEADIER = 0.8  # For an idling engine
+# Firing frequency of an idling engine, Hz; depth of the level's modulation, dB, and its sharpness.
 _FIRING_HZ, _RATTLE_DB, _SHARPNESS = (15.0, 45.0), 16.0, (1.0, 4.0)
-_FOLLOWED = np.array((0.3, 0.3, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0))  # More of its knocking is heard above 500 Hz
-# Share of the sounds with tones of gears, motors and fans; how many, Hz, of which amplitude.
+_FOLLOWED = np.array((0.3, 0.3, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0))  # Knocking is stronger above 500 Hz
+# Share of the sounds with tones of gears, motors and fans; their number, frequency in Hz and amplitude.
 _TONES = {
     "passes": (0.2, 4, (250.0, 900.0)),
     "tram": (1.0, 4, (250.0, 900.0)),
@@ -57,16 +57,16 @@ _TONES = {
 }
 _TONE_GAIN = (0.02, 0.5)
 _REVERBERATION_S, _DIRECT_DB, _OUTDOORS = (0.1, 2.0), (-6.0, 15.0), 0.2
-# Over the noise in the band that the guard hears.
+# Above the noise in the band of the guard.
 _SNR_DB, BAND_HZ = (0.0, 30.0), (250.0, 2600.0)
-# Shots, barks and steps are recorded where it is calm: their pauses are silent.
+# Shots, barks and steps are recorded in quiet places: their pauses are silent.
 _CALM_DB = (0.0, 55.0)
 
 
 def close_vehicle(
     kind: VehicleKind, preset: Preset, site: Site, seconds: float, rate_hz: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw a vehicle that passes close by in the open, shape (samples,), of any level."""
+    """Draw a vehicle that passes close by in the open, shape (samples,), at any level."""
     passes_s, speed = rng.uniform(0.1, 0.9) * seconds, rng.uniform(*(kind.ridden_mps or SPEEDS_MPS))
     time = np.arange(0.0, seconds, 0.1) - passes_s
     harder = RIDDEN_MPS2 if kind.turns_hz else ACCELERATIONS_MPS2
@@ -79,14 +79,14 @@ def close_vehicle(
 def idling_vehicle(
     kind: VehicleKind, preset: Preset, site: Site, seconds: float, rate_hz: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw a vehicle that stands close by with its engine on, shape (samples,), of any level."""
+    """Draw a stationary vehicle close by with a running engine, shape (samples,), at any level."""
     sound = _in_the_open(kind, np.zeros(len(np.arange(0.0, seconds, 0.1))), 0.0, preset, site, rate_hz, rng)
-    if kind.turns_hz:  # Its pulses are in its sound
+    if kind.turns_hz:  # Its sound already contains the pulses
         return _fluctuating(sound, rate_hz, rng, _STEADIER)
     firing_hz = rng.uniform(*_FIRING_HZ) * (1.0 + 0.02 * drift(len(sound), rate_hz, 0.3, rng))
     cycles = np.cumsum(firing_hz) / rate_hz
     pulse = (0.5 + 0.5 * np.cos(2.0 * np.pi * cycles)) ** rng.uniform(*_SHARPNESS) - 0.5
-    # Of two or four cylinders one is louder.
+    # One of two or four cylinders is louder.
     uneven = 0.3 * rng.random() * np.cos(np.pi * cycles * rng.choice((0.5, 1.0)))
     rattle_db = rng.choice((0.0, 1.0)) * rng.uniform(0.0, _RATTLE_DB)
     octaves = split_octaves(sound.astype(np.float32), rate_hz).astype(np.float64)
@@ -96,7 +96,7 @@ def idling_vehicle(
 
 
 def close_sound(kind: str, seconds: float, rate_hz: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a sound of a kind of `SOUNDS` in a yard, a room or the open, shape (samples,), of any level."""
+    """Draw a sound of a kind of `SOUNDS` in a yard, a room or the open, shape (samples,), at any level."""
     sound = emitted(sound_kind(kind), round(seconds * rate_hz), rate_hz, rng).astype(np.float64)
     if rng.random() < _OUTDOORS:
         return sound
@@ -111,14 +111,14 @@ def close_sound(kind: str, seconds: float, rate_hz: float, rng: np.random.Genera
 def recorded(
     sound: FloatArray, rate_hz: float, rng: np.random.Generator, *, calm: bool = False
 ) -> Float32Array:
-    """Add noise of a drawn colour and hear both by a recorder of a drawn frequency response, shape (n,)."""
+    """Add noise of a drawn spectrum and apply a drawn frequency response to both, shape (n,)."""
     hz, white = _frequencies(len(sound), rate_hz), rng.standard_normal(len(sound))
     colour_db = rng.uniform(*_NOISE_SLOPES_DB) * np.log2(np.maximum(hz, 40.0) / 500.0)
     noise = _filtered(white, colour_db + _wavy_db(hz, _RECORDER_DB, rng))
     noise *= 10.0 ** (rng.uniform(*_SWELL_DB) * drift(len(sound), rate_hz, 1.0, rng) / 20.0)
     band = scipy.signal.butter(4, BAND_HZ, "bandpass", fs=rate_hz, output="sos")
     loud, beside = (np.square(scipy.signal.sosfilt(band, one)) for one in (sound, noise))
-    # Over its louder third: a pause is none.
+    # Signal level of the louder third, which excludes pauses.
     parts = np.sort([part.mean() for part in np.array_split(loud, max(len(loud) // round(0.1 * rate_hz), 1))])
     ratio_db = rng.uniform(*(_CALM_DB if calm else _SNR_DB))
     louder = parts[-len(parts) // 3 :].mean() + np.finfo(float).tiny
@@ -139,8 +139,8 @@ def _in_the_open(
     rate_hz: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Render a vehicle on a straight way, its front at the microphone at `passes_s`; speeds every .1 s."""
-    # An event is faded in and out where it is out of earshot: so much longer it is, and cut.
+    """Render a vehicle on a straight road, its front at the microphone at `passes_s`; speeds every 0.1 s."""
+    # An event fades in and out when it is out of earshot: it is rendered longer by the fades, and cut.
     around = round(FADE_S / 0.1)
     speeds = np.pad(speeds_mps, around, mode="edge")
     driven = np.cumsum(np.r_[0.0, 0.05 * (speeds[1:] + speeds[:-1])])
@@ -150,7 +150,7 @@ def _in_the_open(
     route = along([[distance, FAR_M], [distance, -FAR_M]])
     event = VehicleEvent("passes", Manoeuvre(LEFT, Motion(route, time, driven, speeds, kind, -1), 0.0), 0.0)
     alone = Microphones(np.array([[0.0, 0.0, height]]), np.zeros(1), np.ones(1), rate_hz)
-    # The preset takes bass from engines, which streets do not have and close passes do.
+    # The preset lowers the bass of engines in streets; close passes keep it.
     heard = event_sound(event, in_the_open(site), replace(preset, engine_bass_db=0.0), alone, rng)
     sound = heard.pressure_pa[0].astype(np.float64)
     first, length = round(FADE_S * rate_hz), round(0.1 * len(speeds_mps) * rate_hz)
@@ -186,7 +186,7 @@ def _with_tones(sound: FloatArray, of: str, rate_hz: float, rng: np.random.Gener
 
 
 def _wavy_db(hz: FloatArray, spread_db: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a curve of normal numbers an octave apart and straight lines between them, shape of `hz`."""
+    """Draw normal numbers an octave apart, linearly interpolated, shape of `hz`."""
     octaves = np.arange(np.log2(40.0), np.log2(hz[-1]) + 1.0)
     return np.interp(np.log2(hz), octaves, spread_db * rng.standard_normal(len(octaves)))
 

@@ -1,4 +1,4 @@
-"""What the vehicles of every flow do at a junction: their routes, where they slow down, stand and end."""
+"""Manoeuvres of the vehicles of every flow at a junction: routes, speed limits, stops and ends."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,12 +25,12 @@ from worldstate.simulation.scene.vehicle import (
 from worldstate.simulation.sound.static_field import LATE_DISTANCE_M, late_level_db
 
 STEP_M = 0.05
-ACCELERATION_MPS2, COMFORTABLE_MPS2 = 1.5, 2.0  # comfortable values of drivers in towns
+ACCELERATION_MPS2, COMFORTABLE_MPS2 = 1.5, 2.0  # Comfortable values of drivers in towns
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedLimit:
-    """A highest speed at one point of a route, and how long the vehicle stands there."""
+    """A maximum speed at one point of a route, and the length of a stop there."""
 
     at_m: float
     speed_mps: float = 0.0
@@ -40,7 +40,7 @@ class SpeedLimit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Where a vehicle is on a clock of its own, which begins at 0."""
+    """Position of a vehicle on its own clock, which begins at 0."""
 
     route: Route
     time_s: FloatArray  # shape (N,): Not decreasing
@@ -51,15 +51,15 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
-        """When it ends."""
+        """Time of its end."""
         return float(self.time_s[-1])
 
     def reaches_s(self, driven_m: float) -> float:
-        """When the front has driven so far; where it stands there, when it goes on."""
+        """Return when the front has driven a distance; at a stop, when the vehicle leaves."""
         return float(self.time_s[max(int(np.searchsorted(self.driven_m, driven_m, side="right")) - 1, 0)])
 
     def trajectory(self, time_s: FloatArray, heard: Route | None = None) -> Trajectory:
-        """Return position and speed at some times, on the route or where its sound comes from."""
+        """Return position and speed at some times, on the route or on the route of its sound."""
         route = heard or self.route
         driven = np.interp(time_s, self.time_s, self.driven_m)
         x, y = route.at(driven)
@@ -69,9 +69,9 @@ class Motion:
 
 
 def confined(route: Route, near_m: float, far_m: float) -> Route:
-    """Return the route with its way ahead kept between two limits.
+    """Return the route with its distance ahead kept between two limits.
 
-    What turned into another street is heard from that street's mouth.
+    The sound of a vehicle in another street comes from that street's mouth.
     """
     driven = np.arange(route.driven_m[0], route.driven_m[-1], 0.5)
     x, y = route.at(driven)
@@ -79,11 +79,11 @@ def confined(route: Route, near_m: float, far_m: float) -> Route:
 
 
 TURN_MPS, ARC_STEPS = 4.0, 16
-OWN_LANE_M = 1.8  # beside the ego, whose half width is .9 m, with what a side wall leaves
-KERB_M = 0.95  # half a vehicle and a hand's breadth
-BESIDE_M, SHORTEST_M = 30.0, 10.0  # how far into another street a vehicle is followed
-# Out of earshot: in the octaves of 125 Hz to 2 kHz so far below the ambience, round the corner (which takes
-# 12 dB at least in deep shadow) and by the late field, which has no direction. Wind covers what is lower.
+OWN_LANE_M = 1.8  # Beside the ego, whose half width is 0.9 m, as far as a side wall allows
+KERB_M = 0.95  # Half a vehicle and a hand's breadth
+BESIDE_M, SHORTEST_M = 30.0, 10.0  # Distance over which a vehicle is followed into another street
+# Out of earshot: this far below the ambience in the octaves of 125 Hz to 2 kHz, round the corner (at least 12
+# dB in deep shadow) and in the late field, which has no direction. Wind masks lower octaves.
 INAUDIBLE_DB, LATE_INAUDIBLE_DB, SHADOW_DB, HEARD_OCTAVES = 15.0, 6.0, 12.0, slice(1, 6)
 EARSHOT_M = (15.0, 80.0)
 LEFT, RIGHT = "left", "right"
@@ -91,25 +91,25 @@ LEFT, RIGHT = "left", "right"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Manoeuvre:
-    """One vehicle's motion and how it is heard."""
+    """Motion of one vehicle, and the origin of its sound."""
 
-    arm: str  # The hidden arm that it comes out of, goes into or stays in
+    arm: str  # Hidden arm that it leaves, enters or stays in
     motion: Motion
-    arrives_s: float  # The moment of its clock that its flow's arrival time stands for
-    heard: Route | None = None  # Where its sound comes from, if not from where it is
-    gap_s: float = 0.0  # Behind the arrival that it belongs to
+    arrives_s: float  # Time of its clock that equals its flow's arrival time
+    heard: Route | None = None  # Route of its sound, if it differs from its own
+    gap_s: float = 0.0  # Time behind the arrival that it belongs to
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Driver:
-    """A vehicle and its street: what every manoeuvre is drawn for."""
+    """A vehicle and its street, for which manoeuvres are drawn."""
 
     site: Site
     kind: VehicleKind
     arm: str
     speed_mps: float
     braking_mps2: float  # Before the junction; 0 for none
-    reach_m: float  # Beyond it nothing of the vehicle is heard
+    reach_m: float  # The vehicle is inaudible beyond
 
     @property
     def side(self) -> float:
@@ -117,29 +117,29 @@ class Driver:
         return 1.0 if self.arm == LEFT else -1.0
 
     def lane_m(self, into: bool = False) -> float:
-        """How far ahead it drives when it comes out of its arm, or goes into it."""
+        """Return the distance ahead of its lane when it leaves its arm, or enters it."""
         near, far = self.site.lanes_m
         return near if (self.arm == LEFT) is not into else far
 
     def reach_from(self, before_m: float) -> float:
-        """How far before a point in the arm, which lies so far before line of sight, it is first heard."""
+        """Return the first audible distance before a point that is `before_m` before line of sight."""
         return max(self.reach_m - before_m, SHORTEST_M)
 
     def entry_y_m(self) -> float:
-        """Where on its lane it comes into the camera's line of sight."""
+        """Return the y on its lane at which it comes into line of sight."""
         return entry_y_m(self.site, self.lane_m(), self.arm)
 
     def motion(
         self, route: Route, span_m: tuple[float, float], limits: Sequence[SpeedLimit], into: bool = False
     ) -> Motion:
-        r"""Drive from one distance to another as fast as the limits allow; `into` the arm or out of it.
+        r"""Drive from one distance to another as fast as the limits allow, `into` the arm or out of it.
 
         .. math:: v(s) = \min\Big(v_0, \sqrt{v_i^2 + 2 b_i (s_i - s)}\ (s < s_i),
                   \sqrt{v_i^2 + 2 a (s - s_i)}\ (s > s_i)\Big)
         """
         stops = sorted((one for one in limits if one.stands_s > 0.0), key=lambda one: one.at_m)
         edges = [span_m[0], *(one.at_m for one in stops), span_m[1]]
-        # A stop is in the grid twice: between both nothing is driven and time goes by.
+        # A stop is in the grid twice: between both points the distance is constant and time passes.
         counts = [max(round((high - low) / STEP_M), 1) + 1 for low, high in pairwise(edges)]
         driven = np.concatenate(list(map(np.linspace, edges, edges[1:], counts)))
         speed = np.full_like(driven, self.speed_mps)
@@ -166,7 +166,7 @@ def draw_driver(
 
 
 def earshot_m(site: Site, kind: VehicleKind, speed_mps: float, preset: Preset) -> float:
-    """Distance beyond which a vehicle in a hidden arm is lost in the ambience in all octaves that count."""
+    """Return the distance beyond which ambience masks a vehicle in a hidden arm in all relevant octaves."""
     speed = np.array([speed_mps])
     power = [10.0 ** (law(speed, kind)[:, 0] / 10.0) for law in (rolling_level_db, propulsion_level_db)]
     level = 10.0 * np.log10(np.sum(power, axis=0)) + POWER_TO_1M_DB + preset.vehicles_db(site)
@@ -177,14 +177,14 @@ def earshot_m(site: Site, kind: VehicleKind, speed_mps: float, preset: Preset) -
 
 
 def emerges(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
-    """Come out of the arm, cross the view and go on into the other arm."""
+    """Drive out of the arm, cross the view and continue into the other arm."""
     slowest = max(driver.speed_mps - 2.0 * driver.braking_mps2, 0.25 * driver.speed_mps)
     limits = [SpeedLimit(0.0, slowest, braking_mps2=driver.braking_mps2)] if driver.braking_mps2 else []
     return _through(driver, limits)
 
 
 def waits(driver: Driver, rng: np.random.Generator, stands_s: tuple[float, float] = (4.0, 25.0)) -> Manoeuvre:
-    """Stand before the corner for some time, then come out."""
+    """Stop before the corner for some time, then drive out."""
     return _through(driver, [SpeedLimit(-rng.uniform(1.0, 6.0), 0.0, rng.uniform(*stands_s))])
 
 
@@ -219,7 +219,7 @@ def drives_off(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
 
 
 def joins(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
-    """Come out of a side street behind the corner, turn into the arm and drive away."""
+    """Leave a side street behind the corner, turn into the arm and drive away."""
     turn = driver.lane_m(into=True) - TURN_RADIUS_M, _hidden_y_m(driver, rng.uniform(8.0, 35.0))
     driven = _turn_into(replace(driver, reach_m=BESIDE_M), turn, (1.0, 0.0))
     near, far = driver.site.lanes_m
@@ -227,7 +227,7 @@ def joins(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
 
 
 def _hidden_y_m(driver: Driver, before_m: float) -> float:
-    """Return y in the arm, so far before the line of sight of the lane that leads into it."""
+    """Return the y in the arm at a distance before the line of sight of the lane that leads into it."""
     return entry_y_m(driver.site, driver.lane_m(into=True), driver.arm) + driver.side * before_m
 
 
@@ -259,7 +259,7 @@ def from_behind(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
 
 
 def from_ahead(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
-    """Come towards the ego and turn into the arm; with a wall opposite, pull out from the kerb in view."""
+    """Approach the ego and turn into the arm; with a wall opposite, pull out from the kerb in view."""
     lane = driver.lane_m(into=True)
     if driver.site.opposite_wall_m is None:
         return _turn_into(driver, (lane + TURN_RADIUS_M, 1.2), (-1.0, 0.0))
@@ -283,14 +283,14 @@ MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
     "stands": stands,
     "leaves": drives_off,
     "joins": joins,
-    # New flows stand last: a flow draws by its number.
+    # New flows come last, because a flow's generator depends on its number.
     "stops": partial(waits, stands_s=(2.0, 10.0)),
     "distant": partial(passes_far, away_m=(60.0, 120.0)),
 }
 
 
 def _through(driver: Driver, limits: list[SpeedLimit]) -> Manoeuvre:
-    """Drive along the crossing street; the arrival is the line of sight."""
+    """Drive along the crossing street; the arrival is the time of line of sight."""
     lane, entry = driver.lane_m(), driver.entry_y_m()
     route = along([[lane, entry], [lane, entry - driver.side]])
     motion = driver.motion(route, (-driver.reach_m, 2.0 * abs(entry) + driver.reach_m), limits)
@@ -298,7 +298,7 @@ def _through(driver: Driver, limits: list[SpeedLimit]) -> Manoeuvre:
 
 
 def _turn_into(driver: Driver, turn_m: tuple[float, float], towards: tuple[float, float]) -> Manoeuvre:
-    """Come straight to a point in view or beside the ego, turn there into the arm and leave by it."""
+    """Drive straight to a point in view or beside the ego, turn there into the arm and leave by it."""
     corner = _arc(turn_m, towards, (0.0, driver.side))
     before = np.array(turn_m) - towards
     points = np.concatenate([[before], corner, corner[-1:] + np.array([0.0, driver.side])])
@@ -309,19 +309,19 @@ def _turn_into(driver: Driver, turn_m: tuple[float, float], towards: tuple[float
 
 
 def _beside(driver: Driver, route: Route, span_m: tuple[float, float], limits: list[SpeedLimit]) -> Manoeuvre:
-    """Drive where only the mouth of another street lets the sound out."""
+    """Drive in another street, whose mouth alone emits the sound."""
     near, far = driver.site.lanes_m
     motion = driver.motion(route, span_m, limits)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0), confined(route, near, far))
 
 
 def _arc(start_m: tuple[float, float], towards: tuple[float, float], then: tuple[float, float]) -> FloatArray:
-    """Quarter circle from a point, shape (ARC_STEPS, 2)."""
+    """Return a quarter circle from a point, shape (ARC_STEPS, 2)."""
     angle = np.linspace(0.0, 0.5 * np.pi, ARC_STEPS)[:, None]
     turned = np.sin(angle) * np.array(towards) + (1.0 - np.cos(angle)) * np.array(then)
     return np.asarray(np.array(start_m) + TURN_RADIUS_M * turned)
 
 
 def behind(leader: Manoeuvre, headway_s: float, kind: VehicleKind) -> Manoeuvre:
-    """Return a follower, which drives as the one in front does."""
+    """Return a follower, which drives like its leader."""
     return replace(leader, motion=replace(leader.motion, kind=kind), gap_s=leader.gap_s + headway_s)

@@ -1,7 +1,7 @@
-"""A stream as blocks of samples: pieces of background and whole events, added up in their order.
+"""A stream as blocks of samples: pieces of background and whole events, summed in order.
 
-Microphones keep their faults throughout, the background has no seam, and every event is rendered by itself
-over the time in which it can be heard.
+Microphones keep their faults throughout, the background has no seam, and every event is rendered separately
+over its audible time.
 """
 
 from collections.abc import Generator, Sequence
@@ -35,13 +35,13 @@ from .settings import StreamSettings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Microphones:
-    """Where the microphones of one or several arrays are and how they differ."""
+    """Positions of the microphones of one or several arrays, and their mismatch."""
 
     positions_m: FloatArray  # shape (M, 3): In `base_link`, z above the road
     skew_s: FloatArray  # shape (M,): Phase mismatch as a delay
     gains: FloatArray  # shape (M,): About 1
     sample_rate_hz: float
-    sizes: tuple[int, ...] = ()  # Microphones of each array, one after another; empty: all are one array's
+    sizes: tuple[int, ...] = ()  # Number of microphones of each array, in order; empty for one array
 
     @property
     def slices(self) -> list[slice]:
@@ -57,7 +57,7 @@ class Microphones:
 
     @classmethod
     def joined(cls, arrays: Sequence["Microphones"]) -> "Microphones":
-        """Return the microphones of several arrays, which all have their centre in one place."""
+        """Return the microphones of several arrays whose centres coincide."""
         return cls(
             np.concatenate([one.positions_m for one in arrays]),
             np.concatenate([one.skew_s for one in arrays]),
@@ -67,28 +67,28 @@ class Microphones:
         )
 
     def receiver(self, knots_s: FloatArray, ego: EgoMotion = STANDING) -> Receiver:
-        """Return these microphones, listening between knots, shape (K + 1,)."""
+        """Return these microphones as a receiver between knots, shape (K + 1,)."""
         return Receiver(self.positions_m, self.skew_s, knots_s, ego)
 
 
 def draw_microphones(
     settings: StreamSettings, array: MicrophoneArray, rng: np.random.Generator
 ) -> Microphones:
-    """Draw what differs between the channels, once for a whole stream."""
+    """Draw the mismatch of the channels, once for a whole stream."""
     positions = standing_m(array)
     skew = settings.preset.delay_mismatch_s * rng.standard_normal(len(positions))
     gains = 10.0 ** (settings.preset.gain_mismatch_db * rng.standard_normal(len(positions)) / 20.0)
     return Microphones(positions, skew, gains, settings.sample_rate_hz)
 
 
-# As long as a distant vehicle swells or fades: one that is cut by a piece's end would begin within a shorter
-# overlap as no vehicle does (with 2 s the spectrogram showed where the pieces begin).
+# As long as the rise or fall of a distant vehicle: in a shorter overlap a vehicle that a piece's end cuts
+# would begin too fast (with 2 s the spectrogram showed the starts of the pieces).
 OVERLAP_S = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreamScene:
-    """What stays the same through a stream."""
+    """Constant properties of a stream."""
 
     settings: StreamSettings
     ambience: Ambience
@@ -98,14 +98,14 @@ class StreamScene:
     def drawn(
         cls, settings: StreamSettings, microphones: Microphones, rng: np.random.Generator
     ) -> "StreamScene":
-        """Draw what a stream makes of its site's ambience, which stays the same through the stream."""
+        """Draw the ambience of a stream, which is constant within it."""
         preset = settings.drawn_preset
         ambience = recording_ambience(site_ambience(settings.site, preset), preset, rng)
         return cls(settings, ambience, microphones)
 
     @property
     def piece(self) -> int:
-        """Samples in a piece; not shorter than two overlaps, so that only neighbours meet; a drive is one."""
+        """Samples in a piece: at least two overlaps, so that only neighbours meet; a drive is one piece."""
         if not self.settings.ego.stands:
             return self.settings.samples
         rate = self.settings.sample_rate_hz
@@ -113,22 +113,22 @@ class StreamScene:
 
     @property
     def within_s(self) -> tuple[float, float]:
-        """What is rendered of the events: all, of a drive what is heard in it, often a third."""
+        """Rendered time of the events: all, or for a drive the time within it, often a third."""
         return ALWAYS_S if self.settings.ego.stands else (0.0, self.settings.duration_s)
 
 
 def ambience_piece(
     scene: StreamScene, samples: int, rng: np.random.Generator, *, begins: bool
 ) -> Float32Array:
-    """Render background, shape (M, samples + overlap), faded at both ends; not where the stream begins."""
-    # Neighbouring pieces know nothing of each other: where the squares of their fades add up to one, the
-    # power stays the same. A fade of amplitudes would leave a dip of 3 dB in the middle.
+    """Render background, (M, samples + overlap), faded at both ends except at the stream's start."""
+    # Neighbouring pieces are independent: if the squares of their fades sum to one, the power is constant. A
+    # fade of amplitudes would leave a dip of 3 dB in the middle.
     settings, overlap = scene.settings, overlap_samples(scene.settings)
     sound = np.zeros((len(scene.microphones.positions_m), samples + overlap), np.float32)
     receiver = scene.microphones.receiver(np.arange(2) * KNOT_SAMPLES / settings.sample_rate_hz)
     add_ambience(sound, receiver, settings.site, settings.drawn_preset, rng, scene.ambience)
     if settings.rain_db is not None:
-        # From a second before the piece to a second after it: a shower sets in and ends slowly.
+        # From a second before the piece to a second after it, because a shower starts and ends slowly.
         lasts_s = sound.shape[1] / settings.sample_rate_hz + 2.0
         static = StaticSources(sound, settings.sample_rate_hz)
         shower = SoundSettings("rain", -1.0, lasts_s, level_offset_db=settings.rain_db)
@@ -142,38 +142,38 @@ def ambience_piece(
 
 
 def overlap_samples(settings: StreamSettings) -> int:
-    """Length of a cross-fade; a drive is one piece."""
+    """Return the length of a cross-fade; a drive is one piece."""
     return round(OVERLAP_S * settings.sample_rate_hz) if settings.ego.stands else 0
 
 
-HEAD_START_S = 1.0  # emission begins this long before it is heard: 100 m of way and the late field
+HEAD_START_S = 1.0  # Emission begins this long before reception: 100 m of path and the late field
 FADE_S = 2.0
-# Into another street the block's corner takes 6 dB after 3 m and 22 dB after 10 m, about Maekawa's curve for
-# 500 Hz at some 40 m from the corner on one side.
+# In another street the block's corner attenuates by 6 dB after 3 m and 22 dB after 10 m, about Maekawa's
+# curve for 500 Hz at some 40 m from the corner on one side.
 SHADE_M = 3.0
 ROW_S = 0.1
 ALWAYS_S = (-np.inf, np.inf)
-# Where a vehicle behind a corner masks another: below it wind and engines of whole blocks are heard.
+# Band in which a vehicle behind a corner masks another; below it, wind and distant engines dominate.
 BAND_HZ = (300.0, 2000.0)
-SILENCE_PA2 = 1e-14  # -46 dB, below any level that means something; a logarithm of zero would not be JSON
+SILENCE_PA2 = 1e-14  # -46 dB, below any relevant level; the logarithm of zero would not be JSON
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EventSound:
-    """What the microphones hear of one event alone."""
+    """Sound of one event alone at the microphones."""
 
-    first: int  # Sample of the stream, negative where it began before
+    first: int  # Sample of the stream; negative if it began before
     pressure_pa: Float32Array  # shape (M, n)
 
 
 def rendered_s(event: Event, within_s: tuple[float, float] = ALWAYS_S) -> tuple[float, float]:
-    """Return from when to when of the stream an event is rendered: what else sounds always to its end."""
+    """Return the time span of the stream in which an event is rendered; other sounds run to their end."""
     end_s = event.end_s if isinstance(event, SoundEvent) else min(event.end_s, within_s[1])
     return max(event.start_s, within_s[0]), end_s
 
 
 def event_blocks(event: Event, rate_hz: float, within_s: tuple[float, float] = ALWAYS_S) -> int:
-    """Length of what is rendered of an event in knots."""
+    """Return the rendered length of an event in knots."""
     begin_s, end_s = rendered_s(event, within_s)
     return int(np.ceil((end_s - begin_s) * rate_hz / KNOT_SAMPLES))
 
@@ -187,7 +187,7 @@ def event_sound(
     ego: EgoMotion = STANDING,
     within_s: tuple[float, float] = ALWAYS_S,
 ) -> EventSound:
-    """Render one event within some time of the stream, faded in and out where it is out of earshot."""
+    """Render one event within a time span of the stream, faded in and out when it is out of earshot."""
     rate = microphones.sample_rate_hz
     knot_s = np.float64(KNOT_SAMPLES / rate)
     blocks, before = event_blocks(event, rate, within_s), int(np.ceil(HEAD_START_S / knot_s))
@@ -201,7 +201,7 @@ def event_sound(
         add_sound(street, event.sound, rng)
     else:
         time, manoeuvre = np.arange(-before, blocks + 1) * knot_s, event.manoeuvre
-        # The clock of what is rendered begins with it, that of the vehicle may have begun before.
+        # The rendered clock begins with the render; the vehicle's clock may have begun before.
         path = replace(manoeuvre.motion.trajectory(time + late_s, manoeuvre.heard), time_s=time)
         add_vehicle(street, path, rng)
         if event.signal:
@@ -212,7 +212,7 @@ def event_sound(
 
 
 def _envelope(event: Event, site: Site, receiver: Receiver, late_s: float) -> Float32Array:
-    """Amplitude over the event: its ends, and the block that it is behind in another street, shape (n,)."""
+    """Return the amplitude over the event: its fades, and the shadow of a block in another street, (n,)."""
     knots = receiver.knots_s + late_s
     ends = smooth_step(np.minimum(knots, event.end_s - event.start_s - knots) / FADE_S)
     if isinstance(event, VehicleEvent) and event.manoeuvre.heard is not None:
@@ -224,7 +224,7 @@ def _envelope(event: Event, site: Site, receiver: Receiver, late_s: float) -> Fl
 
 
 def band_filter(sample_rate_hz: float) -> FloatArray:
-    """Return the second-order sections that pass `BAND_HZ`, or what the rate holds of it."""
+    """Return the second-order sections that pass `BAND_HZ`, as far as the rate allows."""
     band = BAND_HZ[0], min(BAND_HZ[1], 0.45 * sample_rate_hz)
     return np.asarray(scipy.signal.butter(4, band, "bandpass", fs=sample_rate_hz, output="sos"))
 
@@ -232,13 +232,13 @@ def band_filter(sample_rate_hz: float) -> FloatArray:
 def loudness_db(
     sound: EventSound, rows_s: FloatArray, sample_rate_hz: float, *, banded: bool = False
 ) -> FloatArray:
-    """Sound pressure level over the tenth of a second round each time, mean over the microphones.
+    """Return the sound pressure level over the tenth of a second round each time, mean over microphones.
 
-    Of everything, or of `BAND_HZ` alone. Shapes: rows_s (R,).
+    The level is that of the whole spectrum or of `BAND_HZ`. Shapes: rows_s (R,).
     """
     pressure = sound.pressure_pa
     if banded:
-        # Of every eighth microphone: levels differ little between them, and filtering takes time.
+        # Every eighth microphone is enough: levels differ little between them, and filtering takes time.
         pressure = scipy.signal.sosfilt(band_filter(sample_rate_hz), pressure[::8])
     power = np.einsum("mn,mn->n", pressure, pressure, dtype=np.float64)
     energy = np.r_[0.0, np.cumsum(power)] / len(pressure)
@@ -248,9 +248,9 @@ def loudness_db(
     return np.asarray(10.0 * np.log10(np.maximum(mean, SILENCE_PA2) / REFERENCE_PA**2))
 
 
-# What one process renders at a time: 40 MB of sound for 56 channels at 6 kHz, 80 MB at the full rate.
+# Length that one process renders at a time: 40 MB of sound for 56 channels at 6 kHz, 80 MB at the full rate.
 PIECE_S, PIECE_SAMPLES = 30.0, 360_000
-AMBIENCE, EVENT, EGO_NOISE = 3, 4, 8  # purposes of generators
+AMBIENCE, EVENT, EGO_NOISE = 3, 4, 8  # Purposes of generators
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,27 +263,27 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Sound from one sample on, and the loudness of the events that are in it from their beginning."""
+    """Sound from one sample on, and the loudness of the events that begin in it."""
 
     pressure_pa: Float32Array  # shape (M, n)
-    # shape (arrays, 2, R): At the rows of every event, of all and of `BAND_HZ`, at each array
+    # shape (arrays, 2, R): At the rows of every event, broadband and in `BAND_HZ`, at each array
     loudness_db: dict[int, FloatArray]
 
 
 def row_times(event: Event, settings: StreamSettings) -> FloatArray:
-    """Return the tenths of a second of the stream in which an event is heard or seen, shape (R,)."""
+    """Return the tenths of a second of the stream in which an event is audible or visible, shape (R,)."""
     first, last = max(event.start_s, 0.0), min(event.end_s, settings.duration_s)
     begin, end = (int(np.ceil(time_s / ROW_S - 1e-9)) for time_s in (first, last))
     return ROW_S * np.arange(begin, end, dtype=np.float64)
 
 
 def render_blocks(scene: StreamScene, events: Sequence[Event], jobs: int = 1) -> Generator[Block, None, None]:
-    """Yield a stream from its beginning; what comes out does not depend on the number of jobs."""
+    """Yield the blocks of a stream in order; they do not depend on the number of jobs."""
     length, left = scene.piece, scene.settings.samples
     pending = np.zeros((len(scene.microphones.positions_m), 0), np.float32)
     with closing(in_processes(partial(render_piece, scene), pieces(scene, events), jobs)) as rendered:
         for piece in rendered:
-            # An event may last beyond the next piece: either of the two may be the longer one.
+            # An event may last beyond the next piece, so either of the two may be the longer one.
             shorter, sound = sorted((pending, piece.pressure_pa), key=lambda one: one.shape[1])
             sound[:, : shorter.shape[1]] += shorter
             yield Block(sound[:, : min(length, left)], piece.loudness_db)
@@ -291,7 +291,7 @@ def render_blocks(scene: StreamScene, events: Sequence[Event], jobs: int = 1) ->
 
 
 def pieces(scene: StreamScene, events: Sequence[Event]) -> list[Piece]:
-    """Deal the events to the pieces that they begin in; those before the stream to the first one."""
+    """Assign the events to the pieces in which they begin; events before the stream go to the first piece."""
     first = np.maximum([event.start_s for event in events], 0.0) * scene.settings.sample_rate_hz
     owner = (first // scene.piece).astype(int)
     return [
@@ -301,7 +301,7 @@ def pieces(scene: StreamScene, events: Sequence[Event]) -> list[Piece]:
 
 
 def render_piece(scene: StreamScene, piece: Piece) -> Block:
-    """Render the background of one piece and all that begins in it, to the end."""
+    """Render the background of one piece and, completely, all events that begin in it."""
     settings, begin = scene.settings, piece.number * scene.piece
     rate, within = settings.sample_rate_hz, scene.within_s
     ends = [
@@ -311,7 +311,7 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
     samples = max([end - begin for end in ends] + [scene.piece + overlap_samples(settings)])
     sound = np.zeros((len(scene.microphones.positions_m), samples), np.float32)
     loudness = {}
-    with threadpool_limits(1):  # the number of BLAS threads would change the last bits
+    with threadpool_limits(1):  # The number of BLAS threads would change the last bits
         _add_background(sound, scene, piece.number)
         for number, event in piece.events.items():
             alone, rows_s = _event_alone(scene, number, event), row_times(event, settings)
@@ -325,7 +325,7 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
 
 
 def _event_alone(scene: StreamScene, number: int, event: Event) -> EventSound:
-    """Render one event at all arrays; weather at each by itself, for drops and gusts hit microphones."""
+    """Render one event at all arrays; weather at each separately, because drops and gusts hit microphones."""
     settings, microphones = scene.settings, scene.microphones
     street, drive = (settings.site, settings.drawn_preset), (settings.ego, scene.within_s)
     if not isinstance(event, SoundEvent) or event.sound.kind not in WEATHER:
@@ -337,10 +337,10 @@ def _event_alone(scene: StreamScene, number: int, event: Event) -> EventSound:
     return EventSound(heard[0].first, np.concatenate([one.pressure_pa for one in heard]))
 
 
-# What every microphone hears by itself is drawn array by array from the same generator: what an array hears
-# does not depend on the arrays beside it.
+# The uncorrelated noise of the microphones is drawn array by array from the same generator, so the sound of
+# an array does not depend on the other arrays.
 def _add_background(sound: Float32Array, scene: StreamScene, number: int) -> None:
-    """Add the ambience of one piece and, over a drive, what the ego itself sounds like."""
+    """Add the ambience of one piece and, for a drive, the ego's own noise."""
     settings, ego = scene.settings, scene.settings.ego
     for own, microphones in zip(scene.microphones.slices, scene.microphones.arrays, strict=True):
         rng = settings.generator(AMBIENCE, number)

@@ -1,4 +1,4 @@
-"""What a stream is, before anything is drawn."""
+"""Settings of a stream, before anything is drawn."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,13 +15,12 @@ from worldstate.simulation.scene.presets import Preset, preset
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS, SAMPLE_RATE_HZ, SIGNALS, SOUNDS
 from worldstate.simulation.scene.vehicle import EgoMotion
 
-# What a flow is, is drawn in `manoeuvres.py`; these bring vehicles out of a hidden arm.
+# `manoeuvres.py` draws each flow; these flows bring vehicles out of a hidden arm.
 HAZARDS = ("left", "right", "both", "waits", "queue", "stops")
 _ELSEWHERE = ("turns_away", "parks", "far", "distant", "stands", "leaves", "joins")
 FLOWS = (*HAZARDS, *_ELSEWHERE, "from_behind", "from_ahead")
 MOST_PER_HOUR = 3600.0
-# Cars, delivery vans and lorries, electric cars, bicycles and kick scooters of a side street; assumed, not
-# counted.
+# Cars, delivery vans and lorries, electric cars, bicycles and kick scooters of a side street; assumed shares.
 TOWN_KINDS = {
     **{"light": 0.70, "medium": 0.07, "heavy": 0.03, "electric": 0.08},
     **{"bicycle": 0.10, "scooter": 0.02},
@@ -30,20 +29,22 @@ TOWN_KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Weather, and arrivals an hour of every flow: Poisson processes unless hazards are evenly spaced."""
+    """Weather, and arrivals per hour of every flow: Poisson processes unless hazards are evenly spaced."""
 
     name: str
-    per_hour: Mapping[str, float]  # Of each of `FLOWS`; those not named never come
-    follower_share: float = 0.0  # Probability that a vehicle out of a hidden arm has another one behind it
-    evenly: bool = False  # Whether arrivals out of hidden arms take turns instead of meeting by chance
-    headway_s: tuple[float, float] = (1.5, 4.0)  # Between one that leads and the next behind it
-    apart_s: float | None = None  # At most between two from both sides, either first; None: a normal .7 s
-    kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normed
-    sounds: Mapping[str, float] = field(default_factory=dict)  # What else sounds, by kind, an hour
-    signals: Mapping[str, float] = field(default_factory=dict)  # Shares of the vehicles that warn, by signal
-    # Of ambience and wind over the preset's, dB: each stream draws its level between these two, evenly.
+    per_hour: Mapping[str, float]  # Rate of each of `FLOWS`; missing flows have none
+    follower_share: float = 0.0  # Probability that a vehicle out of a hidden arm has a follower
+    evenly: bool = False  # Whether arrivals out of hidden arms are spaced evenly rather than at random
+    headway_s: tuple[float, float] = (1.5, 4.0)  # Time between a leader and its follower
+    # Maximum time between two vehicles from both sides, either first; None: normal, 0.7 s
+    apart_s: float | None = None
+    kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normalised
+    sounds: Mapping[str, float] = field(default_factory=dict)  # Other sounds per hour, by kind
+    # Shares of the vehicles with a warning signal, by signal
+    signals: Mapping[str, float] = field(default_factory=dict)
+    # Range of ambience and wind above the preset's, dB; each stream draws its level uniformly.
     background_db: tuple[float, float] = (0.0, 0.0)
-    rain_share: float = 0.0  # Probability that it rains throughout a stream
+    rain_share: float = 0.0  # Probability of rain throughout a stream
 
     def __post_init__(self) -> None:
         for name, known, most in (
@@ -62,7 +63,7 @@ class Traffic:
         in_range("background_db[0]", self.background_db[0], -40.0, self.background_db[1])
         in_range("background_db[1]", self.background_db[1], -40.0, 30.0)
         in_range("rain_share", self.rain_share, 0.0, 1.0)
-        # A share of one would make a queue without an end.
+        # A share of one would make an endless queue.
         in_range("follower_share", self.follower_share, 0.0, 0.9)
         in_range("kinds: sum of the shares", sum(self.kinds.values()), 1e-6, 1e6)
 
@@ -80,8 +81,8 @@ _MISLEADING = {
     "children music drill birds steps horns": 10.0,
     "saw siren wail sweeps turns tune drums shots bell": 5.0,
 }
-# A side street at midday and a district road in the rush hour; `no-hazard` is the latter without vehicles
-# out of a hidden arm: whatever warns there is wrong. `empty` is background alone.
+# A side street at midday and a district road in the rush hour; `no-hazard` is the latter without vehicles out
+# of a hidden arm, so that every alarm in it is false. `empty` is background alone.
 TRAFFICS = {
     traffic.name: traffic
     for traffic in (
@@ -92,25 +93,25 @@ TRAFFICS = {
             follower_share=0.15,
         ),
         Traffic("busy", {"left": 45, "right": 45, "both": 8, "waits": 10} | _OTHERS, follower_share=0.3),
-        # One hazard after another, what an exam of approaches asks for: of 36 in 14.4 minutes twenty come
-        # alone, ten from both sides at once and six with another one behind them.
+        # One hazard after another, for an exam of approaches: of 36 in 14.4 minutes twenty come alone, ten
+        # from both sides at once and six with a follower.
         Traffic(
             "approaches",
             {"left": 125 / 3, "right": 125 / 3, "both": 125 / 3, "queue": 25} | _OTHERS,
             evenly=True,
         ),
-        # As above with arrivals as streets have them: arms that do not know of each other, and followers as
-        # near as a vehicle's length allows. Of 36 in 14.4 minutes 17 come alone, 12 from both sides.
+        # As above with realistic arrivals: independent arms, and followers at any possible distance. Of 36 in
+        # 14.4 minutes 17 come alone, 12 from both sides.
         Traffic("pairs", {"left": 35, "right": 35, "both": 50, "queue": 30} | _OTHERS, **_IN_PAIRS),
         Traffic("no-hazard", _OTHERS),
-        # What misleads: everything that is near, loud or grows louder and never comes out of an arm.
+        # Misleading traffic: near, loud or increasingly loud vehicles that never come out of an arm.
         Traffic(
             "misleading",
             {"turns_away": 20, "parks": 20, "far": 60, "from_behind": 20, "from_ahead": 20}
             | {"stands": 30, "leaves": 50, "joins": 40},
             sounds={kind: rate for kinds, rate in _MISLEADING.items() for kind in kinds.split()},
         ),
-        # One kind of it at a time, as an exam asks; what stands sounds nearly all the time.
+        # One kind of it at a time, for exams; stationary sources sound nearly all the time.
         Traffic("receding", {"leaves": 30, "joins": 30}),
         Traffic("standing", {"stands": 60}),
         Traffic("far", {"far": 60}),
@@ -121,9 +122,9 @@ TRAFFICS = {
         Traffic("speech", {}, sounds={"voice": 150, "children": 150}),
         Traffic("music", {}, sounds={"music": 100, "tune": 100, "drums": 100}),
         Traffic("empty", {}),
-        # What a model learns, in weather that varies: as above, a sixth after a stop of 2 to 10 s.
+        # Training traffic in varying weather: as above, a sixth after a stop of 2 to 10 s.
         Traffic("town", {"left": 30, "right": 30, "both": 40} | _STOPPING | _OTHERS, **_IN_PAIRS),
-        # One kind of hazard alone, as an exam asks.
+        # One kind of hazard alone, for exams.
         Traffic("stops", {"stops": 150}, evenly=True),
         *(
             Traffic(f"{kind}-only", {"left": 75, "right": 75}, evenly=True, kinds={kind: 1.0})
@@ -131,10 +132,11 @@ TRAFFICS = {
         ),
     )
 }
-# In its last 3 s before T0, 300 to 2000 Hz, a vehicle of `pairs` raises the level over ambience and wind by
-# 8.7 dB in the median stream of the first renderer and by 3.6 dB of the second, between streams by 4.6 to
-# 13.2 and 0.2 to 8.2 (5 to 95 %; 16 and 8 streams). With a background of -14 to 8 dB by 14.0 and 5.7, 3.0 to
-# 24.8 and 1.2 to 11.4; that of `varied` was not measured. Rates of gusts and the share of rain are assumed.
+# In its last 3 s before T0, at 300 to 2000 Hz, a vehicle of `pairs` raises the level above ambience and wind
+# by 8.7 dB in the median stream of the first renderer and by 3.6 dB of the second; streams range from 4.6 to
+# 13.2 and from 0.2 to 8.2 dB (5 to 95 %; 16 and 8 streams). With a background of -14 to 8 dB it is 14.0 and
+# 5.7 dB, from 3.0 to 24.8 and from 1.2 to 11.4; for `varied` it was not measured. Rates of gusts and the
+# share of rain are assumed.
 _WEATHERS: Mapping[str, Mapping[str, Any]] = {
     "gusts": {"sounds": {"wind": 360.0}},
     "rain": {"rain_share": 1.0},
@@ -145,7 +147,7 @@ _WEATHERS: Mapping[str, Mapping[str, Any]] = {
 
 
 def _under(base: Traffic, weather: str) -> Traffic:
-    """Return a traffic in a weather, named after both."""
+    """Return a traffic in a weather, with both names joined."""
     changed: dict[str, Any] = {"name": f"{base.name}-{weather}"}
     for key, value in _WEATHERS[weather].items():
         changed[key] = {**getattr(base, key), **value} if isinstance(value, Mapping) else value
@@ -167,14 +169,14 @@ def traffic_named(name: str) -> Traffic:
     return TRAFFICS[one_of("traffic", name, TRAFFICS)]
 
 
-# A log of detections holds 100,000 images, ten a second.
+# A log of detections has at most 100,000 images, ten per second.
 MAX_MINUTES = 160.0
-# A drive down the own street to the corner. Five seconds before line of sight are judged, and the first one
-# has no hop yet; recordings of a moving ego stop after 7.3 to 9 s.
+# A drive along the ego's street to the corner. Five seconds before line of sight are evaluated, and the first
+# second has no hop; recordings of a moving ego stop after 7.3 to 9 s.
 MAX_DRIVE_MINUTES, STOPS_S = 1.0, (8.0, 9.0)
-EGO, BACKGROUND, RAIN = 7, 9, 10  # purposes of generators
-# Light rain of 1 mm/h to a downpour of some 16, against the moderate one of 4 mm/h of the table of sounds, if
-# the power of drops rises a little faster than their volume (assumed).
+EGO, BACKGROUND, RAIN = 7, 9, 10  # Purposes of generators
+# Light rain of 1 mm/h to a downpour of some 16 mm/h, relative to the moderate 4 mm/h of the table of sounds,
+# if the power of drops rises a little faster than their volume (assumed).
 RAIN_DB = (-8.0, 8.0)
 
 
@@ -185,15 +187,15 @@ class StreamSettings:
     Parameters
     ----------
     site : Site
-        The junction. Where its name says that the ego moves, the stream is one drive up to the corner.
+        The junction. At a site with a moving ego the stream is one drive up to the corner.
     minutes : float
         Length, 0.05 to 160; of a drive up to 1.
     seed : int
-        Of everything that is drawn.
+        Seed of everything that is drawn.
     traffic : Traffic
         Arrivals of every flow.
     preset : Preset
-        Levels of everything else.
+        Levels and spectra of everything else.
     sample_rate_hz : float
         2 to 96 kHz; sound is rendered up to half of it.
 
@@ -231,7 +233,7 @@ class StreamSettings:
 
     @property
     def ego(self) -> EgoMotion:
-        """How the ego moves, as drawn for recordings; it stands but for a drive."""
+        """Motion of the ego, drawn as for recordings; it stands except in a drive."""
         if not ego_moves(self.site.name):
             return EgoMotion()
         rng = self.generator(EGO)
@@ -239,19 +241,19 @@ class StreamSettings:
 
     @property
     def background_db(self) -> float:
-        """Level of ambience and wind that this stream draws, over the preset's."""
+        """Drawn level of ambience and wind of this stream, above the preset's."""
         return float(self.generator(BACKGROUND).uniform(*self.traffic.background_db))
 
     @property
     def drawn_preset(self) -> Preset:
-        """The preset, with its ambience and wind at the level that this stream draws."""
+        """The preset with the ambience and wind of this stream."""
         level_db, usual = self.background_db, self.preset
         octaves_db = tuple(octave_db + level_db for octave_db in usual.ambient_octaves_db)
         return replace(usual, ambient_octaves_db=octaves_db, wind_100hz_db=usual.wind_100hz_db + level_db)
 
     @property
     def rain_db(self) -> float | None:
-        """Level of the rain that falls throughout, over moderate rain; None if it does not rain."""
+        """Level of continuous rain above moderate rain; None without rain."""
         rng = self.generator(RAIN)
         return float(rng.uniform(*RAIN_DB)) if rng.random() < self.traffic.rain_share else None
 
@@ -266,5 +268,5 @@ class StreamSettings:
         return round(self.duration_s * self.sample_rate_hz)
 
     def generator(self, *purpose: int) -> np.random.Generator:
-        """Return the generator of one purpose, whatever was drawn before for others."""
+        """Return the generator of one purpose, independent of draws for others."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=purpose))

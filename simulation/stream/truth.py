@@ -1,4 +1,4 @@
-"""What only the simulation knows of a stream: every vehicle, every tenth of a second."""
+"""Ground truth of a stream: every vehicle at every tenth of a second."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,18 +27,18 @@ from .arrivals import STANDING, SoundEvent, VehicleEvent
 from .rendering import row_times
 from .settings import HAZARDS, StreamSettings
 
-CLOCK_S = 0.01  # resolution of the first line of sight
-PARKED_SHARE = 0.3  # of the streams have a car at the far kerb, as recordings do
-# A box is reported once the vehicle is this far ahead: nearer, it fills the image from edge to edge.
+CLOCK_S = 0.01  # Resolution of the first line of sight
+PARKED_SHARE = 0.3  # Share of the streams with a parked car at the far kerb, as in recordings
+# A box is reported from this distance ahead; a nearer vehicle fills the whole image.
 NEAREST_BOX_M = 3.0
-# Boxes that are nothing, one to three images long; most scores lie below what the readers of a detector keep
-# (.75). The rate is an assumption: a good detector in daylight, about one such box a minute.
+# False boxes, one to three images long; most scores are below the threshold of a detector's users (0.75). The
+# rate is assumed: a good detector in daylight, about one such box per minute.
 CLUTTER_PER_HOUR, CLUTTER_IMAGES, CLUTTER_SCORE = 60.0, (1, 3), (0.3, 0.9)
 CLUTTER_WIDTH_PX, CLUTTER_SHAPE = (60.0, 400.0), (0.4, 1.0)
 
 
 def visible_s(event: VehicleEvent, site: Site, ego: EgoMotion = STANDING) -> float | None:
-    """Time of the stream at which a vehicle first comes into view; None where it never does."""
+    """Return the time at which a vehicle first comes into view; None if it never does."""
     clock = np.arange(0.0, event.manoeuvre.motion.duration_s, CLOCK_S)
     path, ego_x = event.manoeuvre.motion.trajectory(clock), ego.x_m(event.start_s + clock)
     seen = line_of_sight(path, site, PinholeCamera.ovad(), ego_x)
@@ -51,7 +51,7 @@ def detected_frames(
     sounds: Sequence[SoundEvent],
     rng: np.random.Generator,
 ) -> list[Frame]:
-    """Boxes of a whole stream: vehicles with misses, a parked car in some, clutter; rain takes some."""
+    """Return boxes of a whole stream: vehicles with misses, some parked cars, clutter; rain removes some."""
     camera, to_park, to_clutter, to_vehicles, to_rain = PinholeCamera.ovad(), *rng.spawn(4)
     count = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
     frames: list[Frame] = [()] * count
@@ -68,7 +68,7 @@ def _add_boxes(frames: list[Frame], event: VehicleEvent, site: Site, rng: np.ran
     first, last = (int(np.ceil(time_s * FRAME_RATE_HZ)) for time_s in (event.start_s, event.end_s))
     numbers = np.arange(max(first, 0), min(last, len(frames)))
     path = event.manoeuvre.motion.trajectory(numbers / FRAME_RATE_HZ - event.start_s)
-    # What is beside or behind the camera has no picture in it.
+    # Objects beside or behind the camera are not in the image.
     ahead = path.behind(0.0)[0] > NEAREST_BOX_M
     boxes = detect(path.at(path.time_s[ahead]), site, PinholeCamera.ovad(), rng)
     for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
@@ -82,7 +82,7 @@ def _add_clutter(frames: list[Frame], rng: np.random.Generator) -> None:
         width = rng.uniform(*CLUTTER_WIDTH_PX)
         height = width * rng.uniform(*CLUTTER_SHAPE)
         left = rng.uniform(0.0, camera.width_px - width)
-        # About the horizon, where a detector that knows streets looks for vehicles.
+        # Near the horizon, where a street detector expects vehicles.
         top = rng.uniform(0.3, 0.7) * (camera.height_px - height)
         left, top, right, bottom = (round(float(v), 1) for v in (left, top, left + width, top + height))
         box = SimulatedDetection((left, top, right, bottom), round(float(rng.uniform(*CLUTTER_SCORE)), 4))
@@ -104,7 +104,7 @@ class VehicleTruth:
 
     number: int
     event: VehicleEvent
-    t0_s: float | None  # First line of sight; None where it never comes into view
+    t0_s: float | None  # First line of sight; None if it never comes into view
     time_s: FloatArray  # shape (R,): Tenths of a second of the stream
     x_m: FloatArray  # shape (R,): Front bumper, ahead of the array
     y_m: FloatArray  # shape (R,): Front bumper, left
@@ -119,14 +119,14 @@ class VehicleTruth:
         return self.event.flow in (*HAZARDS, FOLLOWS)
 
     def time_to_visible_s(self) -> list[float | None]:
-        """Time until the first line of sight at every row, negative afterwards; None where it never comes."""
+        """Time until the first line of sight at every row, negative afterwards; None if it never comes."""
         if self.t0_s is None:
             return [None] * len(self.time_s)
         return [round(self.t0_s - time_s, 3) for time_s in self.time_s.tolist()]
 
 
 def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) -> VehicleTruth:
-    """Return where a vehicle is at its rows, and when it is in view."""
+    """Return the positions of a vehicle at its rows, and when it is in view."""
     rows = row_times(event, settings)
     path = event.manoeuvre.motion.trajectory(rows - event.start_s)
     x, y = path.behind(0.0)
@@ -149,7 +149,7 @@ def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) ->
 def describe_events(
     vehicles: Sequence[VehicleTruth], sounds: Sequence[SoundEvent], loudness_db: Mapping[int, FloatArray]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return `events.json`: one entry a vehicle, and one a sound that is none."""
+    """Return `events.json`: one entry per vehicle and per other sound."""
     told = [
         {
             "vehicle": one.number,
@@ -179,7 +179,7 @@ def describe_events(
 
 
 def stream_hazards(folder: Path) -> int:
-    """Count the vehicles that come out of a hidden arm in a stream on disk; 0 where it is not simulated."""
+    """Count the vehicles that come out of a hidden arm in a stream on disk; 0 if it is not simulated."""
     path = folder / EVENTS_NAME
     if not path.is_file():
         return 0
@@ -190,8 +190,8 @@ def stream_hazards(folder: Path) -> int:
 
 
 def describe_stream(settings: StreamSettings, vehicles: Sequence[VehicleTruth]) -> dict[str, Any]:
-    """Return a stream in the form of a recording's truth: its vehicles' rows, each over its own time."""
-    # What reads a recording's truth draws and scores tracks; `entry_s` is the first T0 of all.
+    """Return a stream in the form of a recording's truth: the rows of its vehicles over their times."""
+    # Readers of a recording's truth draw and score tracks; `entry_s` is the first T0 of all vehicles.
     tracks = [_frames(one) for one in vehicles if len(one.time_s)]
     frames = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
     return {
@@ -225,7 +225,7 @@ def _frames(one: VehicleTruth) -> list[dict[str, Any]]:
 def truth_rows(
     vehicles: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]
 ) -> Iterator[list[object]]:
-    """Yield the rows of `vehicles.csv`: one a vehicle and tenth of a second; None is an empty cell."""
+    """Yield the rows of `vehicles.csv`: one per vehicle and tenth of a second; None is an empty cell."""
     for one in vehicles:
         places = np.column_stack([one.x_m, one.y_m, one.speed_mps]).round(2).tolist()
         loudness, seen = loudness_db[one.number][0].round(1).tolist(), one.in_view.astype(int).tolist()

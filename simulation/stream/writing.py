@@ -1,4 +1,4 @@
-"""A continuous stream: all about it is drawn before any of it is rendered, and written while it is."""
+"""A continuous stream: everything is drawn before rendering starts, and written while it is rendered."""
 
 from collections.abc import Callable, Generator
 from contextlib import closing
@@ -34,12 +34,12 @@ from .truth import (
     vehicle_truth,
 )
 
-ARRIVALS, CHANNELS, LEVEL, SOUNDS = 0, 1, 2, 6  # purposes of generators; 3 and 4 are the pieces'
+ARRIVALS, CHANNELS, LEVEL, SOUNDS = 0, 1, 2, 6  # Purposes of generators; 3 and 4 belong to the pieces
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnStream:
-    """Arrivals and microphones of a stream; its sound is written or listened to as it is rendered."""
+    """Arrivals and microphones of a stream; its sound is written or processed while it is rendered."""
 
     scene: StreamScene
     arrays: tuple[MicrophoneArray, ...]
@@ -47,12 +47,12 @@ class DrawnStream:
     sounds: tuple[SoundEvent, ...]
 
     def blocks(self, jobs: int = 1) -> Generator[Block, None, None]:
-        """Yield its sound from the beginning."""
+        """Yield its blocks from the beginning."""
         return render_blocks(self.scene, [*(one.event for one in self.vehicles), *self.sounds], jobs)
 
     def recorded(self, block: Block) -> Float32Array:
-        """Return what the converters of all arrays make of a block, shape (n, M), full scale 1."""
-        # Gains are the converters': they come after everything that sounds, and are in no level of the truth.
+        """Return the output of the converters of all arrays for a block, shape (n, M), full scale 1."""
+        # Gains belong to the converters: they apply last and do not affect levels of the truth.
         gains = (self.scene.microphones.gains / FULL_SCALE_PA).astype(np.float32)[:, None]
         return np.asarray(np.clip(block.pressure_pa * gains, -1.0, 1.0).T)
 
@@ -60,7 +60,7 @@ class DrawnStream:
 def draw_stream(settings: StreamSettings, *arrays: MicrophoneArray) -> DrawnStream:
     """Draw vehicles, other sounds, background and microphones of a stream, each from its own generator.
 
-    Several arrays stand in one place, as if each of them were there alone.
+    Several arrays share one position; each receives the sound it would receive alone.
     """
     events = draw_events(settings, settings.generator(ARRIVALS))
     drawn = [draw_microphones(settings, one, settings.generator(CHANNELS)) for one in arrays]
@@ -80,19 +80,19 @@ HIGHEST_HZ = 3000.0
 
 @dataclass(slots=True)
 class Spectrogram:
-    """Mean power of every line of half a second: an hour of it stays below 10 MB."""
+    """Mean power of lines of half a second: one hour takes less than 10 MB."""
 
     sample_rate_hz: float
     _rest: Float32Array = field(default_factory=lambda: np.zeros(0, np.float32))
     _lines: list[FloatArray] = field(default_factory=list)
 
     def add(self, samples_pa: Float32Array) -> None:
-        """Take in the next samples of the channel, shape (n,)."""
+        """Add the next samples of the channel, shape (n,)."""
         frames = round(LINE_S * self.sample_rate_hz) // FFT_SAMPLES
         length = frames * FFT_SAMPLES
         whole = np.concatenate([self._rest, samples_pa])
         cut = len(whole) // length * length
-        # Blocks without overlap lose a third of the samples to the window, which a picture does not need.
+        # Blocks without overlap lose a third of the samples to the window; a picture does not need them.
         window = np.hanning(FFT_SAMPLES).astype(np.float32)
         blocks = whole[:cut].reshape(-1, frames, FFT_SAMPLES) * window
         for block in blocks:
@@ -116,17 +116,17 @@ class Spectrogram:
 
     def levels_db(self) -> FloatArray:
         """Level of every bin, dB re 20 uPa, shape (T, F)."""
-        scale = 2.0 / (FFT_SAMPLES * 0.375 * FFT_SAMPLES)  # one-sided, by the Hann window's power
+        scale = 2.0 / (FFT_SAMPLES * 0.375 * FFT_SAMPLES)  # One-sided, normalised by the Hann window's power
         power = np.array(self._lines).reshape(-1, len(self.frequencies_hz)) * scale
         return np.asarray(10.0 * np.log10(np.maximum(power, REFERENCE_PA**2 * 1e-3) / REFERENCE_PA**2))
 
 
-CAMERA = 5  # purpose of a generator; the others are the drawn stream's
+CAMERA = 5  # Purpose of a generator; the others are those of the drawn stream
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrittenStream:
-    """What was written, and what a figure of it needs."""
+    """A written stream, and the data of its figure."""
 
     folder: Path
     settings: StreamSettings
@@ -145,19 +145,19 @@ def write_stream(
 ) -> WrittenStream:
     """Simulate a continuous stream with traffic and write it to a folder below `root`.
 
-    The folder is named after site, traffic and seed. It holds `out_multi.wav` (RF64 beyond 4 GiB, written
+    The folder is named after site, traffic and seed. It contains `out_multi.wav` (RF64 beyond 4 GiB, written
     block by block), `array.xml`, camera detections, `truth.json` in the form of a recording's, `events.json`
-    with one entry a vehicle or other sound, and `vehicles.csv` with one row a vehicle and tenth of a second.
-    The same settings give the same bytes, whatever the number of jobs. Interrupted, it leaves nothing.
+    with one entry per vehicle or other sound, and `vehicles.csv` with one row per vehicle and tenth of a
+    second. The same settings give the same bytes for any number of jobs. An interrupted call leaves no files.
 
     Parameters
     ----------
     root : str or Path
-        Folder to write to; made if it is not there. A simulated stream of the same name is replaced.
+        Output folder; it is created if needed. A simulated stream of the same name is replaced.
     settings : StreamSettings
-        What to simulate.
+        Settings of the stream.
     array : MicrophoneArray, optional
-        What listens. Default `ovad_array`.
+        The array. Default `ovad_array`.
     jobs : int
         Processes, 1 to 256.
     progress : callable, optional
@@ -171,9 +171,9 @@ def write_stream(
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range or the ego of the site moves.
+        If a number is out of range or the site has a moving ego.
     InputFileError
-        If something that was not simulated stands there, or the disk is full.
+        If the folder exists and is not simulated, or the disk is full.
 
     Examples
     --------
@@ -195,7 +195,7 @@ def write_stream(
     refuse_foreign(target)
     folder.mkdir(parents=True, exist_ok=True)
     stream = draw_stream(settings, ovad_array() if array is None else array)
-    # Beside the target, on the same disk, so that the whole stream takes its name in one step.
+    # Beside the target on the same disk, so that the whole stream is renamed in one step.
     with TemporaryDirectory(prefix=".simulated-", dir=folder) as hidden:
         temporary = Path(hidden) / target.name
         temporary.mkdir()
@@ -209,7 +209,7 @@ def write_stream(
 def _write_sound(
     path: Path, stream: DrawnStream, jobs: int, progress: Callable[[float], None] | None
 ) -> tuple[Spectrogram, dict[int, FloatArray]]:
-    """Write the blocks as they come; return what one channel hears, and the loudness of all events."""
+    """Write the blocks in order; return the spectrogram of one channel and the loudness of all events."""
     microphones, settings = stream.scene.microphones, stream.scene.settings
     channels, rate = len(microphones.positions_m), settings.sample_rate_hz
     heard, loudness = Spectrogram(rate), dict[int, FloatArray]()
