@@ -1,1 +1,1 @@
-"""Commands of the laboratory: the evaluation of the paper and studies of our own."""
+"""Commands of the laboratory: the evaluation of the paper, and further studies."""

@@ -1,13 +1,13 @@
-"""`worldstate-lab ablations`: what absence, calibration and looming each contribute.
+"""`worldstate-lab ablations`: the contributions of absence, calibration and looming.
 
-Evaluate recordings with everything on ("full") and with one part changed at a time: the signature alone,
-whatever the camera answered; the raw statistic read as the risk; looming added. Thresholds, risk map and the
-weight of looming are set on other recordings, in five folds that are the same in every row.
+Evaluate recordings with all parts ("full") and with one part changed at a time: the signature alone without
+the camera; the raw statistic as the risk; looming added. Thresholds, risk map and the weight of looming are
+set on other recordings, in five folds that are the same in every row.
 
-INPUT is a data set in the OVAD layout or hop streams that `worldstate model threshold --save-streams` wrote;
-approaches need a T0, and there have to be hazard-free recordings. A folder of the real corner (see
-`worldstate-lab sequences`) is heard on its spectra: with the camera trusted fully, with eq. (5), and as the
-whole product publishes it, for each folder of boxes in --boxes, which `worldstate-lab staged` writes.
+INPUT is a data set in the OVAD layout or hop streams of `worldstate model threshold --save-streams`. It needs
+approaches with a T0 and hazard-free recordings. A folder of the real corner (see `worldstate-lab sequences`)
+is evaluated on its spectra: with the camera trusted fully, with eq. (5), and by the published risk of the
+whole product, for each folder of boxes in --boxes, which `worldstate-lab staged` writes.
 
 Examples
 --------
@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     model = read_model(arguments.model)
     policy = model.policies.policies[0]
     switches = AblationSwitches(alpha=arguments.alpha, sustain_hops=policy.sustain_hops)
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _corner(arguments: argparse.Namespace, model: Model, switches: AblationSwitches) -> CommandResult:
-    """Return the rows of a real corner, a table for each folder of boxes."""
+    """Return the rows of a real corner, one table per folder of boxes."""
     recordings = read_recordings(arguments.inputs[0])
     measured = None if arguments.miss_rates is None else load_miss_rates(arguments.miss_rates)
     states, lines = {}, list[str]()

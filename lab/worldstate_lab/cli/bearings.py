@@ -1,14 +1,13 @@
-"""`worldstate-lab bearings`: how true stated deviations of bearings are, and how near bearings beside peers.
+"""`worldstate-lab bearings`: calibration of stated standard deviations, and errors of bearings beside peers.
 
-Sources stand round rings of 4 to 8 microphones, 3 to 10 cm in radius, in simulated rooms (reverberation .3 to
-.8 s, noise 5 to 20 dB below) and in the open; of three seconds every hop counts that shares no frame with the
-one before. Beside the front-end stand pyroomacoustics' methods on the same STFT frames, band and azimuths.
-With --streams hops of streets are judged, in which a vehicle is in view within 20 m; the error is that to the
-nearest one in azimuth.
+Sources surround rings of 4 to 8 microphones, 3 to 10 cm in radius, in simulated rooms (reverberation 0.3 to
+0.8 s, noise 5 to 20 dB below) and in the open. Of three seconds, the hops that share no frame are used. The
+methods of pyroomacoustics run on the same STFT frames, band and azimuths. With --streams, hops of streets
+with a vehicle in view within 20 m are evaluated; the error is the distance to the nearest vehicle in azimuth.
 
 `z` is the root mean square of error over stated deviation, `surest_half` the mean of its square in the half
-of the hops with the least deviation, `median_deg` that of all hops, of the surest half and sixth. Hops for
-which no bearing is stated count as the least sure ones. `beyond_60_deg` is the share of bearings so far off.
+of the hops with the smallest deviation, `median_deg` the median error of all hops, of the surest half and of
+the surest sixth. Hops without a bearing are the least sure. `beyond_60_deg` is the share of larger errors.
 
 Examples
 --------
@@ -43,16 +42,16 @@ from worldstate.operations.metrics.approach_table import Figures
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate_lab.report.table import figure_lines
 
-RATE_HZ, LASTS_S = 24_000, 3.0  # At which nothing is resampled
+RATE_HZ, LASTS_S = 24_000, 3.0  # Rate that needs no resampling
 OPEN_SHARE = 1.0 / 3.0
 PEERS = ("MUSIC", "NormMUSIC", "SRP", "CSSM", "FRIDA")
 SPAN_DEG = 360.0
-SURE, FAR_RAD = 1.0 / 6.0, np.radians(60.0)  # Farther off it is another peak
+SURE, FAR_RAD = 1.0 / 6.0, np.radians(60.0)  # A larger error belongs to another peak
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A ring, the sound at it, and where the source stands."""
+    """A ring, its sound, and the position of the source."""
 
     array: MicrophoneArray
     sound: Float32Array  # shape (n, M)
@@ -61,7 +60,7 @@ class Scene:
 
 
 def drawn_scene(rng: np.random.Generator) -> Scene:
-    """Draw a ring and a source of noise that falls by 3 dB an octave, and let a room or the open carry it."""
+    """Draw a ring and a source of noise that falls by 3 dB per octave, in a room or in the open."""
     pyroomacoustics = _peer()
     count, radius_m = int(rng.integers(4, 9)), rng.uniform(0.03, 0.1)
     round_rad = 2.0 * np.pi * np.arange(count) / count
@@ -100,7 +99,7 @@ def _falling_noise(rng: np.random.Generator) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bearings:
-    """Errors of hops and the deviations stated, infinite where no bearing is; what peers are off by."""
+    """Errors of hops, stated deviations (infinite without a bearing), and the errors of peers."""
 
     error_rad: FloatArray  # shape (n,)
     std_rad: FloatArray  # shape (n,)
@@ -108,13 +107,13 @@ class Bearings:
 
     @classmethod
     def joined(cls, some: Sequence["Bearings"]) -> "Bearings":
-        """Return those of several scenes."""
+        """Return the bearings of several scenes together."""
         parts = [np.concatenate([getattr(one, name) for one in some]) for name in ("error_rad", "std_rad")]
         peers = {name: np.concatenate([one.peers_rad[name] for one in some]) for name in some[0].peers_rad}
         return cls(parts[0], parts[1], peers)
 
     def figures(self) -> Figures:
-        """Return how true they are, and how near."""
+        """Return their calibration and their errors."""
         order = np.argsort(self.std_rad, kind="stable")
         half, sixth = order[: len(order) // 2], order[: round(SURE * len(order))]
         stated = np.isfinite(self.std_rad)
@@ -138,7 +137,7 @@ def _median_deg(errors_rad: FloatArray) -> float:
 
 
 def scene_bearings(number: int, seed: int) -> tuple[bool, Bearings]:
-    """Return whether a scene is a room, and its bearings beside those of peers."""
+    """Return whether a scene is a room, and its bearings with those of peers."""
     scene = drawn_scene(np.random.default_rng((seed, number)))
     settings = ListenSettings(azimuth_span_deg=SPAN_DEG).front_end(scene.array, RATE_HZ)
     frames = FrontEnd(scene.array, RATE_HZ, settings).process(scene.sound)[::BEARING_HOPS]
@@ -151,7 +150,7 @@ def scene_bearings(number: int, seed: int) -> tuple[bool, Bearings]:
 
 
 def _of_peers(scene: Scene, settings: FrontEndSettings, ends: Sequence[int]) -> Mapping[str, FloatArray]:
-    """Return the azimuths that pyroomacoustics' methods find in the frames of every hop's bearing."""
+    """Return the azimuths of pyroomacoustics' methods in the frames of every hop's bearing."""
     nfft, band_hz, positions = settings.nfft, list(settings.srp_band_hz), scene.array.positions_m.T
     spectra = StreamingStft(positions.shape[1], nfft, range(nfft // 2 + 1)).push(scene.sound)
     done = nfft + np.arange(len(spectra)) * (nfft // 2)
@@ -171,7 +170,7 @@ def _of_peers(scene: Scene, settings: FrontEndSettings, ends: Sequence[int]) -> 
 
 
 def street_bearings(heard: HeardStream) -> Bearings:
-    """Return the bearings of the hops of a stream with a vehicle in view near by, beside the nearest one."""
+    """Return the bearings of the hops of a stream with a near vehicle in view, relative to the nearest."""
     hop, inside = heard.row_hops()
     seen = np.flatnonzero(heard.in_view_within(NEAR_M) & inside)
     true = np.arctan2(heard.rows.y_m[seen], heard.rows.x_m[seen])
@@ -191,7 +190,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     if arguments.streams:
         found = {"streets": list(map(street_bearings, map(HeardStream.load, arguments.streams)))}
     else:

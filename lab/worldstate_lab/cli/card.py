@@ -1,10 +1,10 @@
-"""`worldstate-lab card`: what a model's card states of its simulated exam and of real recordings.
+"""`worldstate-lab card`: figures of the simulated exam and of real recordings, for a model's card.
 
---streams examine MODEL as `worldstate model make` does: streams that were listened to for its array, of
-junctions and seeds that it has not learned, with hazards and without. --real takes the AUROC one second
-before T0 and the share of approaches warned of, both by sound alone, from the results of
-`worldstate-lab sequences` over both paths: those of seven microphones are a model's own if it is for the roof
-array and an ego that stands, and every model has the gap of the pair, simulated exam against recordings.
+--streams examine MODEL as `worldstate model make` does: with streams of its array, of junctions and seeds
+that are not in its training, with and without hazards. --real takes the AUROC one second before T0 and the
+share of announced approaches, both by sound alone, from the results of `worldstate-lab sequences` over both
+paths. The figures of seven microphones belong to a model of the roof array with a standing ego; every model
+gets the gap of the pair, simulated exam against recordings.
 
 Examples
 --------
@@ -34,9 +34,9 @@ from worldstate.ground.parallel import in_processes
 from worldstate_lab.cli.main import read_results
 
 ROOF = "a real car's roof (OVAD)"
-# Microphones of each path, and whether it is the roof array's own.
+# Microphones of each path, and whether they belong to the roof array.
 PATHS = {"seven_on_time": (7, True), "pair": (2, False)}
-# Where they stand in an exam, in the record of the pair's exam, and in the record of a path.
+# Keys in an exam, in the record of the pair's exam, and in the record of a path.
 FIGURES = {
     "AUROC one second before T0": (
         *("auroc_1s_before", "auroc_1"),
@@ -60,7 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     model = read_model(arguments.model)
     if arguments.out != arguments.model:
         check_outputs(arguments, "out")
@@ -80,7 +80,7 @@ def _examined(model: Model, path: Path) -> ExaminedStream:
 
 
 def with_real(model: Model, results: Mapping[str, Any]) -> Model:
-    """Return a model whose card states what results of the real corner have of its array, and of the pair."""
+    """Return a model whose card has the real-corner results of its array, and of the pair."""
     found = [one["figures"] for one in results.values()]
     whole = [one.keys() >= PATHS.keys() and "exam" in one["pair"] and one["start_s"] == 0.0 for one in found]
     if sum(whole) != 1:

@@ -1,18 +1,19 @@
-"""`worldstate-lab clips`: what guard and kinds of a model make of single clips of real sound.
+"""`worldstate-lab clips`: verdicts of the guard and the kinds of a model on single clips of real sound.
 
-TABLE.csv has the columns file, kind, recording and road_user: files of one channel or more (the first is
-heard), at any rate from 8 kHz; clips of one recording belong together; road_user is the true class (car,
-van, truck, tram, motorcycle, bicycle) or empty. A clip shorter than the memory of the numbers is led in by
-its mirror image. With --numbers they are read from an archive (`character`, `clip`: the line of the table).
+TABLE.csv has the columns file, kind, recording and road_user. Files have one channel or more (the first is
+used) at any rate of 8 kHz and above; clips of one recording belong together; road_user is the true class
+(car, van, truck, tram, motorcycle, bicycle) or empty. A clip shorter than the memory of the features is
+extended by its mirror image. With --numbers the features are read from an archive (`character`, `clip`: the
+row of the table).
 
-Printed by kind: in which share of the hops the sound is familiar, foreign or a warning signal, and the mean
-probability of each class of road users, and by how much any of these moves at most if the recorder rises or
-falls by 6 dB over the band; over clips with a road_user the log-loss beside that of the shares of the table,
-to which the probabilities are corrected. Every recording counts alike.
+The output has, by kind, the shares of hops that are familiar, foreign or a warning signal, the mean
+probability of each class of road users, and the largest change of any of these if the recorder's response
+rises or falls by 6 dB over the band. For clips with a road_user it has the log-loss and that of the shares of
+the table, to which the probabilities are corrected. Every recording has the same weight.
 
-With --simulated N so many clips of each kind are simulated, and how far their numbers are from the real ones
-is printed beside real against real (halves of the recordings): the median over the numbers of |AUROC - .5|,
-and the area of a boosted classifier that tells them apart.
+--simulated N simulates N clips of each kind and compares their features with the real ones, and real with
+real (halves of the recordings): the median over the features of |AUROC - 0.5|, and the area of a boosted
+classifier.
 
 Examples
 --------
@@ -45,7 +46,7 @@ from worldstate_lab.streets.set_classifiers import boosted_area
 MOST_BYTES = 1 << 30
 NUMBERS = len(MEASURES) + len(BANDS)
 SAID, FOLDS, TILT_DB = 0.9, 4, 6.0
-# Which of the simulator's kinds a kind of clip is held against.
+# Kinds of the simulator with which a kind of clip is compared.
 SIMULATED = {
     **{"car": ("light",), "tram": ("tram",), "engine_idling": tuple(f"idling {kind}" for kind in IDLING)},
     **{"siren": ("siren", "wail", "sweeps", "turns"), "car_horn": ("horn", "horns"), "dog_bark": ("dog",)},
@@ -57,14 +58,14 @@ SIMULATED = {
 class ClipNumbers:
     """Hops of all clips."""
 
-    measures: FloatArray  # shape (n, 49): As `SoundCharacter` reads them
+    measures: FloatArray  # shape (n, 49): From `SoundCharacter`
     clip: IndexArray  # shape (n,): Row of the table
-    kinds: TextArray  # shape (clips,), as the others
+    kinds: TextArray  # shape (clips,), like the others
     recordings: TextArray
-    road_users: TextArray  # Empty where it is none
+    road_users: TextArray  # Empty for clips without a road user
 
     def by_recording(self, values: FloatArray, hops: BoolArray) -> FloatArray:
-        """Mean over recordings of the mean over their hops, shape of `values` less the first axis."""
+        """Return the mean over recordings of the means over their hops, shape of `values[0]`."""
         names = self.recordings[self.clip]
         means = [values[hops & (names == name)].mean(axis=0) for name in np.unique(names[hops])]
         return np.asarray(np.mean(means, axis=0))
@@ -73,7 +74,7 @@ class ClipNumbers:
 def read_clips(
     table: Path, numbers: Path | None, advance: Callable[[], object] = lambda: None
 ) -> ClipNumbers:
-    """Read a table of clips and hear them, or read what was heard of them."""
+    """Read a table of clips and compute their features, or read the features."""
     needed = ("kind", "recording") if numbers is not None else ("file", "kind", "recording")
     rows = [row for _, row in read_rows(table, needed, optional=("road_user",))]
     said = {
@@ -103,7 +104,7 @@ def _archived(path: Path, clips: int) -> tuple[FloatArray, IndexArray]:
 
 
 def judged(clips: ClipNumbers, guard: DomainGuard, model: RoadUserModel) -> dict[str, Any]:
-    """Return what guard and kinds make of the clips, as the report has it."""
+    """Return the verdicts of guard and kinds on the clips."""
     verdicts = [guard.judge(one) for one in clips.measures[:, : len(MEASURES)]]
     familiar, foreign = (
         np.array([isinstance(one, kind) for one in verdicts], float) for kind in (Familiar, Foreign)
@@ -159,7 +160,7 @@ def _calibration(clips: ClipNumbers, model: RoadUserModel) -> dict[str, Any]:
 def realism_rows(
     clips: ClipNumbers, each: int, rng: np.random.Generator, advance: Callable[[], object] = lambda: None
 ) -> dict[str, dict[str, float]]:
-    """Return by kind how far simulated numbers are from real ones, and real from real."""
+    """Return by kind the distance of simulated features from real ones, and of real from real."""
     found = {}
     for kind, names in SIMULATED.items():
         hops = (clips.kinds == kind)[clips.clip]
@@ -191,14 +192,14 @@ def _apart(one: FloatArray, other: FloatArray) -> float:
 def _told_apart(
     one: tuple[FloatArray, IndexArray], other: tuple[FloatArray, IndexArray], rng: np.random.Generator
 ) -> float:
-    """Area of a boosted classifier over folds by clip or recording."""
+    """Return the area of a boosted classifier over folds by clip or recording."""
     origin = np.repeat([0, 1], [len(one[0]), len(other[0])])
     fold = np.concatenate([one[1], other[1]]) % FOLDS
     return boosted_area(np.concatenate([one[0], other[0]]), origin, fold, rng)
 
 
 def clip_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return what is printed for people."""
+    """Return the report as text."""
     kinds = report["kinds"]
     users = list(next(iter(kinds.values()))["road_users"])
     lines = [f"{'kind':18}{'recordings':>11}{'familiar':>10}{'foreign':>9}{'signal':>8}  mean probability"]
@@ -241,7 +242,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     in_range("--simulated", arguments.simulated, 0, 1000)
     model = read_model(arguments.model)
     if model.guard is None or model.road_users is None:

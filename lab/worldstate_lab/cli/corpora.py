@@ -1,14 +1,14 @@
-"""`worldstate-lab corpora`: how well single clips tell vehicles from background, and where they fail.
+"""`worldstate-lab corpora`: separation of vehicles from background in single clips, and its limits.
 
-Reproduce the signature study of "Evidence of Absence", section IX: 16 log-energies a clip, a logistic
-regression, area under the ROC curve of vehicle against background with an interval over recordings.
+Reproduce the signature study of "Evidence of Absence", section IX: 16 log-energies per clip, a logistic
+regression, and the area under the ROC curve of vehicle against background with an interval over recordings.
 
-  by level   the energies themselves, which another gain or distance moves
-  by shape   the energies without their mean, which it does not
+by level   the energies themselves, which change with gain and distance by shape   the energies without their
+mean, which do not
 
-Every row is measured on recordings that were not learned from: the official split where the corpus has one,
-else folds by recording; or everything of one corpus is learned and the other is scored. Electric cars,
-bicycles and trams are rows of their own, by models that never heard them.
+Every row is measured on recordings outside the training: the official split if the corpus has one, else folds
+by recording; or training on one corpus and scoring on the other. Electric cars, bicycles and trams are
+separate rows, with models that were trained without them.
 
   --idmt      the folder of IDMT-Traffic, with audio/ and annotation/ (doi:10.5281/zenodo.7551553)
   --melaudis  a folder with MELAUDIS_Vehicles/ and MELAUDIS_BG/ (doi:10.6084/m9.figshare.27115870)
@@ -47,11 +47,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-CHANCE = 0.5  # Of both figures: a row whose interval holds it has separated nothing
+CHANCE = 0.5  # For both figures: a row whose interval contains it shows no separation
 
 
 def study_lines(study: SignatureStudy) -> list[str]:
-    """Return a table of what was measured, the worst first, and of what would fill the other rows."""
+    """Return a table of the measured rows, the worst first, and of the requirements of the others."""
     filled = [row for row in study.rows if row.value is not None]
     width = max((len(row.name) for row in filled), default=0)
     lines = [f"{'':{width}} {'':17} {'value':>6} {'[interval]':15} {'paper':>11} {'clips':>6}  corpus; how"]
@@ -71,9 +71,9 @@ def study_lines(study: SignatureStudy) -> list[str]:
 
 
 def write_signature_figure(path: Path, study: SignatureStudy) -> None:
-    """Draw the rows that have a value as bars, and the Fisher profile below them."""
+    """Draw the measured rows as bars, and the Fisher profile below them."""
     bars = [row for row in study.rows if row.value is not None and row.figure != "Hz"]
-    # A row keeps its height however many there are, or labels of two lines would overlap.
+    # The height of a row is fixed, so that labels of two lines do not overlap.
     heights = [0.3 * max(len(bars), 1), 2.4] if study.profile is not None else [0.3 * max(len(bars), 1)]
     with figure_file(path, 9.0, sum(heights) + 1.6) as figure:
         figure.suptitle("Signatures of single clips")
@@ -91,7 +91,7 @@ def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
         axes.barh(place, value, color=colour, alpha=0.75, label=row.figure)
         axes.plot([low, high], [place, place], color="black", linewidth=1.2, label="95 % over recordings")
         if row.paper is not None:
-            # A single number is a span of no length: only its marker shows.
+            # A single value is a span of zero length, of which the marker is visible.
             axes.plot(row.paper, [place] * 2, "|-", color=CATEGORIES[3], ms=11, mew=2.5, label="paper")
     axes.set_yticks(places, [f"{row.name}\n{row.corpus}" for row in rows], fontsize=7.0)
     axes.axvline(CHANCE, color="grey", linewidth=0.8, linestyle=":", label="chance")
@@ -122,12 +122,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     if arguments.idmt is None and arguments.melaudis is None:
         raise InvalidArgumentError("expected --idmt, --melaudis or both: the folders of published corpora")
     if arguments.out is not None:
         output_folder(arguments.out, *NAMES)
-    # The second of two, as when clips were simulated by the first: folds and draws stay what they were.
+    # The second generator of two, as when the first simulated clips: folds and draws stay the same.
     _, draws = np.random.default_rng(arguments.seed).spawn(2)
     corpora = published_corpora(arguments)
     with progress_bar("measuring", len(QUESTIONS)) as bar:
@@ -143,8 +143,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def published_corpora(arguments: argparse.Namespace) -> Corpora:
-    """Read the corpora of --idmt and --melaudis; None stands for one that was not given."""
-    # Both folders are looked through before the first clip is heard.
+    """Read the corpora of --idmt and --melaudis; None for a missing one."""
+    # Both folders are checked before the first clip is processed.
     roadside = None if arguments.idmt is None else idmt_traffic(arguments.idmt)
     city = None if arguments.melaudis is None else melaudis(arguments.melaudis)
     return _heard(IDMT, roadside, arguments.jobs), _heard(MELAUDIS, city, arguments.jobs)

@@ -1,14 +1,15 @@
-"""`worldstate-lab foreign`: whether sounds that a model was not made for are told from streets.
+"""`worldstate-lab foreign`: separation of sounds outside the models' domain from streets.
 
-Train a domain guard on streams that were listened to and on simulated sounds at their sites, and judge with
-it what it never heard: every kind of sound by a guard that was trained without that kind, every family of
-kinds by one without that family, every street by one without that site. The threshold is set on the other
-sites: at most .025 of the hops of each of hidden, in view and empty are flagged there, and not below the one
-that was chosen on CC0 recordings. Close passes and sounds at no junction are learned and judged, too.
+Train a domain guard on streams and on simulated sounds at their sites, and evaluate it on sounds outside its
+training: every kind of sound with a guard trained without that kind, every family of kinds with one trained
+without that family, and every street with one trained without that site. The threshold is set on the other
+sites: at most 0.025 of the hops of each of hidden, in view and empty are flagged there, and it is not below
+the threshold chosen on CC0 recordings. Close passes and sounds away from junctions are part of training and
+evaluation, too.
 
-Speech, music, bells, tools, tones, birds, steps and rain are foreign; siren, horn, reversing beeper and bell
-of a bicycle are warning signals, which come from vehicles. A hop counts where the sound is as loud as the
-ambience or louder, from 250 to 2600 Hz over one second.
+Speech, music, bells, tools, tones, birds, steps and rain are foreign; siren, horn, reversing beeper and
+bicycle bell are warning signals, which come from vehicles. A hop is used if the sound is at least as loud as
+the ambience, from 250 to 2600 Hz over one second.
 
 Examples
 --------
@@ -46,7 +47,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate_lab.report.table import Table
 
-# What a listener would take for one another: each left out as a whole.
+# Families of similar kinds, each left out as a whole.
 FAMILIES: Mapping[str, tuple[str, ...]] = {
     "speech": ("voice", "children"),
     "music": ("music", "tune", "drums"),
@@ -55,7 +56,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
     "impacts": ("steps", "rain", "shots"),
     "animals": ("birds", "dog"),
 }
-# What a guard has not heard, and the kinds that it judges: nothing, every kind, every family of several.
+# Kinds left out of training, and the kinds evaluated: none, every kind, every family of several.
 EXAMS: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = (
     ("nothing", (), (*STREET, *FOREIGN, *SIGNALS)),
     *((kind, (kind,), (kind,)) for kind in FOREIGN),
@@ -66,18 +67,19 @@ _FOREIGN, _SIGNAL = 1.0, 2.0
 
 @dataclass(frozen=True, slots=True)
 class GuardShares:
-    """How a guard judged the hops of one kind of sound."""
+    """Verdicts of a guard on the hops of one kind of sound."""
 
-    without: str  # What it had not heard: nothing, a kind or a family; never the site
+    without: str  # Left out of its training: nothing, a kind or a family; always the site
     kind: str
     hops: int
-    foreign: float  # Share called foreign
-    signal: float  # Share called a warning signal
-    worst_site: float  # The least share not taken for the street of all sites; of a street the largest
+    foreign: float  # Share classified as foreign
+    signal: float  # Share classified as a warning signal
+    # Smallest share over sites that is not classified as the street; for a street the largest
+    worst_site: float
 
 
 def guard_exam(rows: SoundRows, advance: Callable[[], object] = lambda: None) -> list[GuardShares]:
-    """Judge every kind by a guard that knows all kinds, by one without it, and by one without its family."""
+    """Evaluate every kind with a guard of all kinds, without the kind, and without its family."""
     found = []
     for name, without, kinds in EXAMS:
         verdicts = _verdicts(rows, without, kinds)
@@ -102,7 +104,7 @@ def _shares(rows: SoundRows, verdicts: FloatArray, without: str, kind: str) -> G
 
 
 def _verdicts(rows: SoundRows, without: Collection[str], kinds: Collection[str]) -> FloatArray:
-    """0 for the street, else a code, by guards that never heard the site, shape (n,)."""
+    """Return 0 for the street, else a code, by guards trained without the site, shape (n,)."""
     sites = np.unique(rows.sites).tolist()
     guards = {
         one: fit_guard(rows.select((rows.sites != one) & ~np.isin(rows.kinds, list(without))))
@@ -133,8 +135,8 @@ def _code(guard: DomainGuard, measures: FloatArray) -> float:
 
 
 NAMES = ("foreign_sounds.json", "foreign_sounds.txt")
-CLIPS_EACH, GUARD_RATE_HZ = 8, 6000.0  # As many in every fold
-SITES = 3  # At least: one that is judged and two others that set its threshold
+CLIPS_EACH, GUARD_RATE_HZ = 8, 6000.0  # The same number in every fold
+SITES = 3  # Minimum: one evaluated site and two that set its threshold
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -148,7 +150,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     in_range("--sounds", arguments.sounds, 1, 100)
     if arguments.out is not None:
         output_folder(arguments.out, *NAMES)
@@ -156,7 +158,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     sites = sorted({str(stream.hops.about["site"]) for stream in streams})
     if len(sites) < SITES:
         raise InvalidArgumentError(f"NPZ: expected streams of {SITES} sites or more, got {', '.join(sites)}")
-    # One microphone is heard: of which array it is the middle makes no difference that a level would not.
+    # One microphone is used; which array it belongs to changes nothing but the level.
     rng = np.random.default_rng(arguments.seed)
     rows = guard_rows(ovad_array(), streams, rng, arguments.sounds)
     rows = SoundRows.joined([rows, of_guard(close_rows(GUARD_RATE_HZ, rng, CLIPS_EACH))])

@@ -1,12 +1,12 @@
-"""`worldstate-lab kinds`: how well kinds of road users are told by their sound.
+"""`worldstate-lab kinds`: classification of road users by their sound.
 
-Let vehicles of every kind pass alone at drawn junctions, hear them with one microphone, and tell their class
-(car, van, truck, tram, motorcycle, bicycle) at junctions that were not learned from. Hops in which a vehicle
-lies more than 6 dB below the ambience are of the class *unknown*. Figures are of the hops from 3 s before to
-1.5 s after line of sight, kinds as frequent as in a town.
+Single vehicles of every kind pass drawn junctions, are recorded by one microphone, and are classified (car,
+van, truck, tram, motorcycle, bicycle) at junctions outside the training. Hops with a vehicle more than 6 dB
+below the ambience belong to the class *unknown*. Figures cover the hops from 3 s before to 1.5 s after line
+of sight, with the kinds as frequent as in a town.
 
-With --streams such hops of streams are judged, as they come, where one vehicle is heard alone; streams are to
-be of other junctions than the drawn ones.
+--streams evaluates such hops of streams with one vehicle alone; the streams must be of other junctions than
+the drawn ones.
 
 Examples
 --------
@@ -46,34 +46,35 @@ CLIPS_EACH = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadUserExam:
-    """Hops near line of sight, at sites that were not learned."""
+    """Hops near line of sight, at sites outside the training."""
 
     log_loss: float  # Mean of -ln p of the true class; nats
-    prior_log_loss: float  # Of the shares of the classes in a town instead
-    worst_site: float  # The largest difference of the two at any site; negative where better everywhere
+    prior_log_loss: float  # The same for the shares of the classes in a town
+    # The largest difference of the two at any site; negative if the model is better everywhere
+    worst_site: float
     classes: tuple[str, ...]
-    shares: FloatArray  # shape (classes,): In a town, as the model has them
+    shares: FloatArray  # shape (classes,): Shares in a town, as in the model
     hops: FloatArray  # shape (classes,): Number
-    confusion: FloatArray  # shape (classes, classes): Mean probability, one row a true class
-    recall: FloatArray  # shape (classes,): Share in which the true class is the likeliest
-    recall_of_equals: FloatArray  # shape (classes,): The same if all classes were as frequent
+    confusion: FloatArray  # shape (classes, classes): Mean probability, one row per true class
+    recall: FloatArray  # shape (classes,): Share of hops in which the true class is the likeliest
+    recall_of_equals: FloatArray  # shape (classes,): The same for equally frequent classes
 
 
 def road_user_exam(rows: RoadUserRows) -> RoadUserExam:
-    """Judge every site by a model that never heard it, kinds as frequent as in a town."""
+    """Evaluate every site with a model trained without it, kinds as frequent as in a town."""
     near = rows.select(rows.counts)
     return _examined(near, cross_validated(rows)[rows.counts], near.weights, town_shares(near))
 
 
 def stream_exam(rows: RoadUserRows, streams: Sequence[HeardStream]) -> RoadUserExam:
-    """Judge hops of streams, as they come, by a model of other sites."""
+    """Evaluate hops of streams with a model of other sites."""
     heard = RoadUserRows.joined([stream_rows(one) for one in streams])
     said = fit_road_users(rows).probabilities(heard.measures)
     return _examined(heard, said, np.ones(len(said)), town_shares(rows))
 
 
 def stream_rows(stream: HeardStream) -> RoadUserRows:
-    """Return the hops of a stream in which one vehicle that comes into view is heard alone."""
+    """Return the hops of a stream in which one vehicle that comes into view is audible alone."""
     measures, usable = heard_characters(stream)
     time_s, vehicles, rows = stream.hops.time_s, stream.vehicles, stream.rows
     levels = np.full((len(vehicles) + 1, len(time_s)), _SILENT_DB)
@@ -103,7 +104,7 @@ def _examined(near: RoadUserRows, said: FloatArray, weights: FloatArray, shares:
         float(np.average((losses - prior)[here], weights=weights[here]))
         for here in (near.sites == name for name in np.unique(near.sites))
     ]
-    # A class that no hop has leaves a row of zeros.
+    # A class without hops has a row of zeros.
     counts = np.bincount(classes, minlength=len(CLASSES)).astype(np.float64)
     confusion = np.stack([said[classes == number].sum(axis=0) for number in range(len(CLASSES))])
     hits, equals = (one.argmax(axis=1) == classes for one in (said, said / shares))
@@ -132,19 +133,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     in_range("--passes", arguments.passes, 1, 100)
     plan = learned_streams(CommissionSettings(junctions=arguments.junctions))
     sites = list(dict.fromkeys(one.site.name for one in plan))
     rng = np.random.default_rng(arguments.seed)
     rate_hz = plan[0].sample_rate_hz
-    # One microphone is heard: that of another array would hear the same, and no level is read.
+    # One microphone is used; one of another array would record the same, and no level is read.
     passes, jobs = arguments.passes, arguments.jobs
     with progress_bar("rendering", passes * len(sites)) as bar:
         rows = road_user_rows(
             ovad_array(), sites, rate_hz, rng, passes=passes, jobs=jobs, on_pass=bar.advance
         )
-    # Close passes by other recorders, as in a model that is made: learned, and of no junction that is judged.
+    # Close passes with other recorders, as in a made model: part of the training, and of no evaluated
+    # junction.
     rows = with_close(rows, close_rows(rate_hz, rng, CLIPS_EACH, jobs))
     streams = [HeardStream.load(path) for path in arguments.streams]
     found = stream_exam(rows, streams) if streams else road_user_exam(rows)

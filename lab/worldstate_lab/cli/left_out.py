@@ -1,15 +1,16 @@
-"""`worldstate-lab left-out`: what a model is worth in streets of a renderer that it did not learn.
+"""`worldstate-lab left-out`: performance of a model in streets of a renderer outside its training.
 
-Streams are those that `worldstate model make` learns from; those that lie in its folder --streams are not
-rendered again. Each renderer is left out once: a window and a sequence model are learned from the streams of
-the other two, as `model make` learns them, and judged on all streams of the one that is left out.
+The streams are those of `worldstate model make`; streams in the folder --streams are not rendered again. Each
+renderer is left out once: a window and a sequence model are trained on the streams of the other two, as in
+`model make`, and evaluated on all streams of the one that is left out.
 
-Figures are compared at equal onsets: the threshold is the lowest with at most --onsets an hour in the
-left-out renderer's own hazard-free streams, those of misleading traffic apart. Printed for each renderer:
+Figures are compared at equal onsets: the threshold is the lowest with at most --onsets per hour in the
+left-out renderer's own hazard-free streams, without misleading traffic. The output has for each renderer:
 approaches detected and their lead, those in advisory in the last second before T0 and in the last hop, onsets
-an hour, Brier skill of the chances at 1, 2 and 3 s, the share of detected approaches whose first advisory has
-the side of the first vehicle (both sides at once apart), and what is detected where no wall stands opposite.
-"learned alarm" is the threshold that the streams of the other two renderers set, as a user would have it.
+per hour, Brier skill of the probabilities at 1, 2 and 3 s, the share of detected approaches whose first
+advisory has the side of the first vehicle (both sides at once excluded), and detections without a wall
+opposite. "learned alarm" is the threshold that the streams of the other two renderers set, which a user would
+have.
 
 Examples
 --------
@@ -64,16 +65,16 @@ from worldstate.operations.metrics.approach_table import ApproachTable, Figures,
 from worldstate_lab.report.table import figure_lines
 
 NEEDS = ("sklearn",)
-ONSETS = {False: 30.0, True: 40.0}  # An hour, by whether the ego moves
-# Windows and trees of every fold, the alarm, the window model, and that judging begins.
+ONSETS = {False: 30.0, True: 40.0}  # Per hour, by whether the ego moves
+# Windows and trees of every fold, the alarm, the window model, and the start of the evaluation.
 STEPS = 2 * FOLDS + 3
-MISLEADING = "misleading"  # How the names of such traffic begin
+MISLEADING = "misleading"  # Prefix of the names of such traffic
 OF_EXAM = (
     *("approaches", "detected", "detected_low", "detected_high", "lead_s", "lead_missed_as_0_s"),
     *("advised_last_second", "advised_at_t0", "skill_1s", "skill_2s", "skill_3s"),
 )
 OF_ALARM = ("hazard_free_hours", "onsets_per_hour", "onsets_low", "onsets_high")
-# A stream as a model reads it, and the levels of its alarm (n, 2): see `alarm_levels`.
+# A stream with the output of a model, and the levels of its alarm (n, 2): see `alarm_levels`.
 Judged = tuple[ExaminedStream, FloatArray]
 
 
@@ -96,7 +97,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     settings, array = _settings(arguments), frontend.ovad_array()
     if arguments.array is not None:
         array = adapters.read_array(arguments.array, arguments.array_axes)
@@ -139,7 +140,7 @@ def _labelled(arguments: argparse.Namespace) -> FeatureTable | None:
 def left_out_row(
     renderer: str, streams: Sequence[HeardStream], fit: FitWindows, settings: CommissionSettings, jobs: int
 ) -> Figures:
-    """Return the row of a renderer whose streams are judged, and not learned."""
+    """Return the row of a renderer that is left out of the training."""
     left, judged = [one for one in streams if one.renderer == renderer], list[Judged]()
     with progress_bar(f"without {renderer}", STEPS + len(left)) as bar:
         step = partial(bar.go_on, amount=1.0)
@@ -160,9 +161,9 @@ def learned_without(
     jobs: int = 1,
     on_step: Callable[[str], None] = lambda stage: None,
 ) -> tuple[EnsembleModel, SequenceModel]:
-    """Return a window and a sequence model that learned no stream of a renderer."""
+    """Return a window and a sequence model that were trained without a renderer."""
     others = [one for one in streams if one.renderer != renderer]
-    # Each renderer has a generator of its own: its row does not depend on the renderers before it.
+    # Each renderer has its own generator, so that its row does not depend on the renderers before it.
     rng = np.random.default_rng(settings.seed)
     sequence = learn_sequence(others, fit, settings.onsets_per_hour, rng, jobs, on_step)
     on_step("window model")
@@ -170,7 +171,7 @@ def learned_without(
 
 
 def judge(windows: EnsembleModel, sequence: SequenceModel, heard: HeardStream) -> Judged:
-    """Return what models read of a stream, without advisories so far, and the levels of its alarm."""
+    """Return the output of models for a stream, without advisories, and the levels of its alarm."""
     evidence = stream_evidence(windows, heard)
     levels = alarm_levels(stream_states(heard, windows, replace(sequence, alarm=UNREACHED), evidence))
     none = np.zeros(levels.shape, bool)
@@ -178,7 +179,7 @@ def judge(windows: EnsembleModel, sequence: SequenceModel, heard: HeardStream) -
 
 
 def renderer_figures(judged: Sequence[Judged], onsets_per_hour: float, learned_nats: float) -> Figures:
-    """Return the row of a renderer: at so many onsets an hour, and at the threshold that others set."""
+    """Return the row of a renderer: at a number of onsets per hour, and at the threshold of the others."""
     quiet = dict[str, list[FloatArray]]()
     for one, levels in judged:
         if one.heard.hazard_free and not _misleads(one.heard):
@@ -203,9 +204,9 @@ def renderer_figures(judged: Sequence[Judged], onsets_per_hour: float, learned_n
 
 
 def sides_right(one: ExaminedStream, levels: FloatArray) -> list[bool]:
-    """Return of each detected approach from one side whether the first advisory has the first vehicle's side.
+    """Return for each approach from one side whether the first advisory has that side.
 
-    If both sides have one at that hop, the side of the higher level counts.
+    If both sides have one at that hop, the side with the higher level is used.
     """
     found = []
     for told in alarm_outcomes(one.heard, one.heard.hops.time_s, one.advised):

@@ -1,4 +1,4 @@
-"""Entry point of `worldstate-lab`: one module per study, as those of `worldstate`."""
+"""Entry point of `worldstate-lab`: one module per study, as in `worldstate`."""
 
 import argparse
 import json
@@ -49,7 +49,7 @@ BENCHES = {
     "bench gospa": f"{BENCH}.gospa",
     "bench import": f"{BENCH}.imports",
 }
-DESCRIPTION = "The evaluation of the paper, and studies of our own."
+DESCRIPTION = "The evaluation of the paper, and further studies."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"
 GROUPS = {"bench": "costs and accuracies of parts of the library, beside peers"}
 PROGRAM = Program(
@@ -60,19 +60,19 @@ Run = Callable[[argparse.Namespace], CommandResult]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one study; return its exit code: 0, or 2 and one line on standard error for bad input."""
+    """Run one study; return its exit code: 0, or 2 with one line on standard error for invalid input."""
     words = sys.argv[1:] if argv is None else argv
     return run_program(PROGRAM, words, prepare=partial(_keep_figures, words))
 
 
 def _keep_figures(words: Sequence[str], study: CommandParser) -> None:
-    """Let a study keep its figures in a results file."""
+    """Add the option that stores a study's figures in a results file."""
     study.add_argument("--results", type=Path, metavar="FILE", help="merge the figures into this file")
     study.set_defaults(run=partial(_run, study.get_default("run"), words))
 
 
 def _run(run: Run, words: Sequence[str], arguments: argparse.Namespace) -> CommandResult:
-    """Run a study and keep its figures, in a file that is read before the work begins."""
+    """Run a study and store its figures in a file that is read before the work begins."""
     if arguments.results is None:
         return run(arguments)
     read_results(arguments.results)
@@ -81,14 +81,14 @@ def _run(run: Run, words: Sequence[str], arguments: argparse.Namespace) -> Comma
     return result
 
 
-# Options that say where work is done and what is written, and change no figure.
+# Options for the place of work and of output, which change no figure.
 _NO_FIGURE = ("--results", "--out", "--predictions", "--jobs", "--cache", "--figure")
 
 
 def result_key(words: Sequence[str]) -> str:
-    """Return a command line by which its figures are found: paths by their names, nothing of where it ran.
+    """Return a command line as the key of its figures: names of paths only, independent of the machine.
 
-    All files of a folder stand together, as they were asked for.
+    All files of a folder are joined, in the given order.
 
     Examples
     --------
@@ -119,7 +119,7 @@ def _named(place: tuple[Path, str], words: Sequence[str]) -> list[str]:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Return the results by key; none where there is no file yet."""
+    """Return the results by key; empty if the file does not exist."""
     check_target(path)
     found = read_json(path, "results of worldstate-lab") if path.exists() else {}
     if not isinstance(found, dict):
@@ -143,7 +143,7 @@ def keep_results(
 
 
 def _seeds(arguments: argparse.Namespace) -> list[int]:
-    """Return the seeds of a command: `seeds` is their number or the seeds themselves."""
+    """Return the seeds of a command: `seeds` is their number or a list."""
     seeds = getattr(arguments, "seeds", None)
     if seeds is None:
         return [arguments.seed] if hasattr(arguments, "seed") else []
@@ -151,7 +151,7 @@ def _seeds(arguments: argparse.Namespace) -> list[int]:
 
 
 def _commit() -> str | None:
-    """Return the commit that this code is checked out at, None outside a checkout."""
+    """Return the commit of this checkout, or None outside a checkout."""
     words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
         return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,14 +1,14 @@
-"""`worldstate-lab place`: error of a place behind the corner, from spatial spectra.
+"""`worldstate-lab place`: error of a position behind the corner, from spatial spectra.
 
-Follow one vehicle along the crossing street of two known junctions with walls and array given, on recorded
-trials (CSV files with spatial spectra, and the place where it is known) and on simulated passes. The error is
-printed beside that of a plain grid filter with constant weights of rays, and of the best constant.
+Follow one vehicle along the crossing street of two known junctions with given walls and array, on recorded
+trials (CSV files with spatial spectra and, if known, the position) and on simulated passes. The errors of a
+plain grid filter with constant weights of rays, and of the best constant, are printed for comparison.
 
 The junctions and the array are those of M. Jeon et al., "Non-Line-of-Sight Vehicle Localization Based on
-Sound", IEEE Transactions on Intelligent Transportation Systems, 2025: facts of the publication's maps. How
-far ahead vehicles cross follows from where they come into view, 4.5 m and 4.0 m aside.
+Sound", IEEE Transactions on Intelligent Transportation Systems, 2025: facts of the publication's maps. The
+distance at which vehicles cross follows from the points at which they come into view, 4.5 m and 4.0 m aside.
 
-Columns of a file of spatial spectra, one row a hop: ``time_s``, ``x_m`` (along the crossing street, right
+Columns of a file of spatial spectra, one row per hop: ``time_s``, ``x_m`` (along the crossing street, right
 positive; may be empty) and ``srp_0`` to ``srp_179``, the steered response on `numpy.linspace(-90, 90, 180)`
 degrees, right positive.
 
@@ -48,15 +48,15 @@ from worldstate_lab.places.spectrum_model import RayModel, SpectrumModel, Street
 from worldstate_lab.report.table import Table
 
 N_AZIMUTHS = 180
-AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, N_AZIMUTHS))  # Of the columns, left positive
+AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, N_AZIMUTHS))  # Azimuths of the columns, left positive
 _SPECTRUM = tuple(f"srp_{i}" for i in range(N_AZIMUTHS))
 _ASIDE_M, _AHEAD_M = (0.338, 0.162, -0.162, -0.338), (-0.192, -0.06, 0.06, 0.192)
 ROOF_ARRAY = MicrophoneArray(np.array([[x, y, 0.0] for x in _AHEAD_M for y in _ASIDE_M]), "roof array of 16")
-# 50 to 2000 Hz of frames of 512 samples at 48 kHz, and of 64 at 6 kHz, at which passes are simulated.
+# 50 to 2000 Hz with frames of 512 samples at 48 kHz, and of 64 at 6 kHz, the rate of simulated passes.
 RATE_HZ, NFFT, BINS = 6000.0, 64, range(1, 22)
 FREQUENCIES_HZ: FloatArray = np.array(BINS) * RATE_HZ / NFFT
 HOP_S = 0.1
-# The truth of a simulation is the front bumper; real places are the middle of the car.
+# The simulated truth is the front bumper; real positions are the middle of the car.
 HALF_LENGTH_M = 2.0
 WALLS: Mapping[str, StreetWalls] = MappingProxyType(
     {
@@ -64,7 +64,7 @@ WALLS: Mapping[str, StreetWalls] = MappingProxyType(
         "Site2": StreetWalls(4.5, 2.78, 2.78, 6.5),
     }
 )
-# Both lanes lie .75 m beside the middle that the model is given.
+# Both lanes are 0.75 m beside the middle that the model uses.
 SIMULATED: Mapping[str, Site] = MappingProxyType(
     {
         "Site1": Site("Site1", 2.8, 2.8, 4.45, 9.9, 2.8, 2.8, 3.0, verge_m=1.2, side_order=8),
@@ -75,15 +75,15 @@ SIMULATED: Mapping[str, Site] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpectrumTable:
-    """Spatial spectra of one recording, with the place of the vehicle where it is known."""
+    """Spatial spectra of one recording, with the position of the vehicle if it is known."""
 
     time_s: FloatArray  # shape (T,)
-    along_m: FloatArray  # shape (T,): Left positive; NaN where it is unknown
+    along_m: FloatArray  # shape (T,): Left positive; NaN if unknown
     spectra: FloatArray  # shape (T, N_AZIMUTHS)
 
 
 def place_models() -> dict[str, SpectrumModel]:
-    """Return what is expected at both junctions."""
+    """Return the models of expected spectra at both junctions."""
     return {
         name: SpectrumModel.of(walls, ROOF_ARRAY, AZIMUTHS_RAD, FREQUENCIES_HZ)
         for name, walls in WALLS.items()
@@ -91,7 +91,7 @@ def place_models() -> dict[str, SpectrumModel]:
 
 
 def read_spectra(path: Path) -> SpectrumTable:
-    r"""Read one recording; `InputFileError` where a column is missing or a number is none.
+    r"""Read one recording; raise `InputFileError` for a missing column or an invalid number.
 
     Examples
     --------
@@ -113,7 +113,7 @@ def read_spectra(path: Path) -> SpectrumTable:
 
 
 def simulated_pass(site: str, rng: np.random.Generator) -> tuple[str, SpectrumTable]:
-    """Draw and render one pass; return the side that it comes from and its spectra."""
+    """Draw and render one pass; return its side and its spectra."""
     side = ("left", "right")[int(rng.integers(2))]
     speed = rng.uniform(2.0, 7.0)
     duration = float(np.clip(rng.uniform(18.0, 30.0) / speed, 4.0, 14.0))
@@ -133,7 +133,7 @@ def simulated_pass(site: str, rng: np.random.Generator) -> tuple[str, SpectrumTa
 
 
 def _spectra(audio: Float32Array) -> FloatArray:
-    """SRP-PHAT of every hop by itself, shape (hops, azimuths)."""
+    """Return the SRP-PHAT of every hop, shape (hops, azimuths)."""
     steering = Steering.towards(ROOF_ARRAY, FREQUENCIES_HZ, AZIMUTHS_RAD)
     frames = StreamingStft(ROOF_ARRAY.n_microphones, NFFT, BINS).push(audio)
     hop = round(RATE_HZ * HOP_S)
@@ -145,12 +145,12 @@ def _spectra(audio: Float32Array) -> FloatArray:
 _NAME = re.compile(r"(Site[12])_([LR])_(\d+)_Trial\d+")
 
 
-# Figures of one pass, and the heads of their columns; those of errors are None where no place is known.
+# Figures of one pass, and their column heads; errors are None if no position is known.
 _COUNTS = {
     "hops": "hops",
     "hidden_hops": "hidden",
-    "side_right": "side",  # Hidden hops in which the likelier side is the right one
-    "stated": "stated",  # Share of hops in which a place is stated
+    "side_right": "side",  # Hidden hops in which the likelier side is right
+    "stated": "stated",  # Share of hops with a stated position
 }
 _ERRORS = {
     "rmse_m": "error",
@@ -167,7 +167,7 @@ PlaceFigures = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class PlaceExam:
-    """Real trials, simulated passes, and what a hop costs."""
+    """Real trials, simulated passes, and the cost of a hop."""
 
     trials: tuple[PlaceFigures, ...]
     passes: tuple[PlaceFigures, ...]
@@ -177,9 +177,9 @@ class PlaceExam:
 def place_exam(
     trials: Sequence[Path], passes: int, seed: int, on_pass: Callable[[], None] = lambda: None
 ) -> PlaceExam:
-    """Score the place on recorded trials, and on passes simulated before the same junctions.
+    """Score positions on recorded trials, and on passes simulated at the same junctions.
 
-    The name of a trial tells its junction to the method, and its side and speed to the scoring alone.
+    The method uses the junction in the name of a trial; its side and speed are used for scoring only.
     """
     ours = {name: PlaceFilter(model) for name, model in place_models().items()}
     plain = {
@@ -203,7 +203,7 @@ def place_exam(
 def _recordings(
     trials: Sequence[Path], passes: int, seed: int
 ) -> Iterator[tuple[str, str, SpectrumTable, FloatArray]]:
-    """Yield name, junction and spectra, and the side by hop: 1 left, -1 right, 0 where it may be in view."""
+    """Yield name, junction and spectra, and the side by hop: 1 left, -1 right, 0 if it may be in view."""
     for path in sorted(trials):
         site, side, speed = _told(path)
         table = read_spectra(path)
@@ -217,9 +217,9 @@ def _recordings(
 
 
 def followed_places(places: PlaceFilter, table: SpectrumTable) -> list[PlaceEstimate]:
-    """Return what is said after every spectrum of a recording."""
+    """Return the estimate after every spectrum of a recording."""
     belief, said = places.unknown, []
-    # Whole nanoseconds: equal hops share one transition of the filter.
+    # Whole nanoseconds, so that equal hops share one transition of the filter.
     stamps_ns = [nanoseconds(time_s) for time_s in table.time_s.tolist()]
     before_ns = stamps_ns[:1] + stamps_ns[:-1]
     for stamp_ns, last_ns, spectrum in zip(stamps_ns, before_ns, table.spectra, strict=True):
@@ -229,7 +229,7 @@ def followed_places(places: PlaceFilter, table: SpectrumTable) -> list[PlaceEsti
 
 
 def _told(path: Path) -> tuple[str, str, float]:
-    """Return junction, side and nominal speed that the name of a trial tells."""
+    """Return the junction, side and nominal speed in the name of a trial."""
     found = _NAME.fullmatch(path.stem)
     if not found:
         raise InputFileError(path, "expected a name such as Site1_L_15_Trial2.csv")
@@ -245,8 +245,8 @@ def _hidden(along_m: FloatArray, walls: StreetWalls) -> BoolArray:
 
 
 def _likely_sides(table: SpectrumTable, side: str, speed_mps: float, walls: StreetWalls) -> FloatArray:
-    """Return the sides of a trial without places."""
-    # It crosses the axis where the loudest directions within the mouth change sides most clearly.
+    """Return the sides of a trial without positions."""
+    # It crosses the axis at the clearest change of side of the loudest directions within the mouth.
     within = np.abs(AZIMUTHS_RAD) < np.arctan2(min(walls.left_m, walls.right_m), walls.corner_ahead_m)
     loudest = AZIMUTHS_RAD[within][table.spectra[:, within].argmax(axis=1)]
     first = 1.0 if side == "left" else -1.0
@@ -268,7 +268,7 @@ def _figures(name: str, said: Sequence[PlaceEstimate], right: FloatArray) -> Pla
 def _errors(
     along_m: FloatArray, said: Sequence[PlaceEstimate], beside: Sequence[PlaceEstimate], walls: StreetWalls
 ) -> PlaceFigures:
-    """Return errors and coverage; the best constants are one place, and one distance while hidden."""
+    """Return errors and coverage; the best constants are one position, and one distance while hidden."""
     known, hidden = np.isfinite(along_m), _hidden(along_m, walls)
     ends = np.array([one.interval_m for one in said])
     covered = (ends[:, 0] <= along_m) & (along_m <= ends[:, 1])
@@ -300,7 +300,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     with progress_bar("following", len(arguments.trials) + arguments.passes) as bar:
         exam = place_exam(arguments.trials, arguments.passes, arguments.seed, bar.advance)
     rows: list[tuple[str, ...]] = []

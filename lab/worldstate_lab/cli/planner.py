@@ -1,11 +1,11 @@
-"""`worldstate-lab planner`: what a planner gains that reads the chances of the state at a blind corner.
+"""`worldstate-lab planner`: the gain of a planner that reads the probabilities of the state.
 
-A simulated car nears blind corners in a closed loop while the states of recorded streams are replayed; their
-vehicles cross as they did and do not mind it. Four planners drive the same car under the same stopping law:
-one knows nothing and brakes for what it sees, one assumes a vehicle behind both corners at every time, one
-remembers what was in sight and assumes it where a vehicle may be unseen, and one assumes it only from a
-chance of the state on, which is set on streams of other seeds (`--set-on`).
-Printed are collisions, braking that no vehicle made necessary, and time.
+A simulated car approaches blind corners in a closed loop while the states of recorded streams are replayed;
+their vehicles cross as recorded and do not react. Four planners drive the same car under the same stopping
+law. The first has no prior information and brakes for visible vehicles. The second always assumes a vehicle
+behind both corners. The third remembers the visible area and assumes a vehicle in the rest. The fourth
+assumes one above a probability of the state, which is set on streams of other seeds (`--set-on`). The output
+has collisions, unnecessary braking, and time.
 
 Examples
 --------
@@ -60,7 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     check_outputs(arguments, figures=("figure",))
     count = int(in_range("--count", arguments.count, 10, 100_000))
     ego = FROM_STANDING if arguments.from_standing else EgoVehicle()

@@ -1,18 +1,19 @@
-"""`worldstate-lab reach`: what any detector could reach with an array and on a data set.
+"""`worldstate-lab reach`: the limit of any detector with an array and on a data set.
 
-Print bounds that no method can beat ("Evidence of Absence", section VI).
+Print bounds that no method can exceed ("Evidence of Absence", section VI).
 
-Of an array: the smallest standard deviation of a bearing, over azimuth, for a noise-like source in --band
+For an array: the smallest standard deviation of a bearing over azimuth, for a noise-like source in --band
 with --snr-db at each microphone and --snapshots independent snapshots, alone and with a camera of
---camera-std; "share" is the bearing information relative to the best direction, which falls to nothing
-towards endfire, while presence and approach speed remain.
+--camera-std. "share" is the bearing information relative to the best direction; it vanishes towards
+endfire, while presence and approach speed remain identifiable.
 
-Of --features, a table of labelled feature windows: the entropy of the class (front, left, none, right), what
-is known of the class from the features, by three estimates, and Fano's bound on the error of any classifier,
-beside the error that the classifier of --method makes on recordings that it was not trained on.
+For --features, a table of labelled feature windows: the entropy of the class (front, left, none, right), the
+information of the features about it by three estimates, and Fano's bound on the error of any classifier,
+beside the error of the classifier of --method on recordings outside its training.
 
-Of --recordings, a data set in the OVAD layout: the Fisher ratio of each band between windows with a vehicle
-and without one, by level and by the shape of the spectrum alone, and the range in which shape tells most.
+For --recordings, a data set in the OVAD layout: the Fisher ratio of each band between windows with and
+without a vehicle, by level and by the shape of the spectrum alone, and the range in which shape is most
+informative.
 
 Examples
 --------
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
 def write_identifiability_figure(
     path: Path, array: ReachOfArray, data: ReachOnData | None, bands: BandProfile | None
 ) -> None:
-    """Draw one panel for each part that was asked for, and write them by the ending of `path`."""
+    """Draw one panel for each requested part, in the format of the ending of `path`."""
     panels = 1 + (data is not None) + (bands is not None)
     with figure_file(path, 5.2 * panels, 3.4) as figure:
         axes = iter(np.atleast_1d(figure.subplots(1, panels)))
@@ -80,7 +81,7 @@ def _draw_data(axes: "Axes", data: ReachOnData) -> None:
     axes.set(xlim=(0.0, 1.0), xlabel=f"share ({data.windows} windows, {data.states} classes)")
 
 
-# Both ways to endfire of an array across the vehicle, where the bound diverges.
+# Up to endfire of a transverse array, at which the bound diverges.
 AZIMUTHS_DEG = tuple(range(-90, 91, 15))
 
 
@@ -101,7 +102,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     check_outputs(arguments, figures=("figure",))
     array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
     if arguments.figure is not None:

@@ -1,21 +1,21 @@
-"""`worldstate-lab realism`: how far simulated feature windows are from real ones.
+"""`worldstate-lab realism`: distance of simulated feature windows from real ones.
 
-Simulate windows at the junctions of a feature table, laid out as the released real ones, over three seeds,
-and hold them against the table. Beside every figure stands the same figure of real against real: between
-groupings of the junctions, and of every junction against the others of its type. A figure outside that range
-is marked with "!", one that is not where simulated streets are asked to be with "x".
+Simulate windows at the junctions of a feature table, in the layout of the released real ones, over three
+seeds, and compare them with the table. Each figure is followed by the same figure of real against real:
+between groupings of the junctions, and of every junction against the others of its type. A figure outside
+that range is marked with "!", and one outside the target range with "x".
 
-  C2ST       how well boosting tells two sets apart; .5 would be indistinguishable
-  AUROC of   the same of one measure alone, by class: level, peak, width, prominence, change, position
-  transfer   the published classifier trained on one and tested on the other, beside the loudest direction
-  medians    of level and shape; within 15 %; and spreads, and the share of variance between sites
-  side       how often left is told from right of hidden windows by a classifier of other junctions
-  positions  what classifiers lose when the features take the microphones to be at permuted positions
+C2ST       separation of two sets by boosting; 0.5 is indistinguishable AUROC of   the same for one measure,
+by class: level, peak, width, prominence, change, position transfer   the published classifier trained on one
+and tested on the other, beside the loudest direction medians    of level and shape; within 15 %; and spreads,
+and the share of variance between sites side       share of hidden windows with the right side, by a
+classifier of other junctions positions  loss of classifiers if the features assume permuted microphone
+positions
 
-FEATURES.csv is a table of labelled windows, such as the one released with OVAD, or one that extract-features
-wrote of a folder in its layout. OUT/realism.json is the report, OUT/windows-SEED.csv what was simulated,
-OUT/permuted-SEED.csv the same with permuted positions: given as --simulated and --permuted, they are held
-against the table again without simulating. OUT/realism.png shows the measures junction by junction.
+FEATURES.csv is a table of labelled windows, such as the one released with OVAD or one of `worldstate model
+features`. OUT/realism.json is the report, OUT/windows-SEED.csv the simulated windows, OUT/permuted-SEED.csv
+the same with permuted positions; as --simulated and --permuted they are compared again without simulation.
+OUT/realism.png shows the measures by junction.
 
 Examples
 --------
@@ -83,7 +83,7 @@ def _draw_measure(
     axes: "Axes", tables: Mapping[str, list[FeatureTable]], sites: list[str], name: str, windows: str
 ) -> None:
     """Draw the middle 90 and 50 % and the median at each junction."""
-    # All simulated sets together: one of ten windows a side and site would show its draws.
+    # All simulated sets together, because one of ten windows per side and site is too noisy.
     for place, site in enumerate(sites):
         for shift, (origin, some) in zip((0.18, -0.18), tables.items(), strict=True):
             values = [_values(table, site, windows, name) for table in some]
@@ -95,7 +95,7 @@ def _draw_measure(
                 axes.plot(middle, height, "o", color=COLOURS[origin], markersize=4.0)
     axes.set(yticks=range(len(sites), 0, -1), yticklabels=sites, xlabel=LABELS.get(name, name))
     if not name.endswith("deg"):
-        # A factor of loudness is the same length everywhere.
+        # A factor of loudness has the same length everywhere.
         axes.set_xscale("log")
         axes.minorticks_off()
         axes.xaxis.set_major_formatter("{x:.3g}")
@@ -103,7 +103,7 @@ def _draw_measure(
 
 
 def _ticks(axes: "Axes") -> FloatArray:
-    """Return four ticks of two digits, evenly spaced in the logarithm; decades would be one or none."""
+    """Return four ticks of two digits, evenly spaced in the logarithm; decades would give one or none."""
     low, high = axes.get_xlim()
     return np.array([float(f"{value:.1e}") for value in np.geomspace(low, high, 6)[1:-1]])
 
@@ -132,7 +132,7 @@ def _draw_key(axes: "Axes") -> None:
 
 Pair = tuple[FeatureTable, FeatureTable | None]
 
-# Windows from either side at every site; the seeds show what one draw of streets changes.
+# Windows per side and site; the seeds show the effect of one draw of streets.
 WINDOWS = 10
 SEEDS = (1, 2, 3)
 
@@ -152,7 +152,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     if arguments.out is not None:
         output_folder(arguments.out, "realism.json", "realism.png")
     real = _chosen(arguments.features, arguments)
@@ -185,7 +185,7 @@ def _chosen(path: Path, arguments: argparse.Namespace) -> FeatureTable:
 
 
 def _simulated(arguments: argparse.Namespace, real: FeatureTable) -> dict[str, Pair]:
-    """Return simulated windows by name, each with those of permuted positions where there are any."""
+    """Return simulated windows by name, each with those of permuted positions if there are any."""
     if arguments.real_only:
         return {}
     if arguments.simulated:
@@ -196,7 +196,7 @@ def _simulated(arguments: argparse.Namespace, real: FeatureTable) -> dict[str, P
             right.stem: (_chosen(right, arguments), None if wrong is None else _chosen(wrong, arguments))
             for right, wrong in tables
         }
-    # A moving ego's junctions come as they are in the table; a site that it lacks has nothing to be held to.
+    # The junctions of a moving ego are those of the table; other sites have no real counterpart.
     sites = sorted(set(real.environments.tolist()))
     found: dict[str, Pair] = {}
     with progress_bar("simulating windows", 4 * WINDOWS * len(sites) * len(SEEDS)) as bar:

@@ -1,12 +1,12 @@
-"""`worldstate-lab scenarios`: what the whole world-state makes of weather, stops and quiet road users.
+"""`worldstate-lab scenarios`: performance of the world-state in weather, at stops and for quiet road users.
 
-Each scenario is a traffic with hazards and one without, rendered at every junction for the model's own array,
-listened to and followed hop by hop without a camera. Printed for each: approaches with an advisory before T0,
-those in advisory in the last second before it and in the last hop, onsets an hour without hazards, and the
-shares of hops that the snapshot counts as unheard, of those whose second holds a gust and of all others.
-Quiet road users count only in scenarios of their own. Streams that lie in --streams are not rendered again.
+Each scenario is a traffic with hazards and one without, rendered at every junction for the model's own array
+and followed hop by hop without a camera. The output has for each: approaches with an advisory before T0,
+those in advisory in the last second before it and in the last hop, onsets per hour without hazards, and the
+shares of unusable hops, among those whose second contains a gust and among all others. Quiet road users are
+scored in their own scenarios only. Streams in --streams are not rendered again.
 
-Choose junctions and a seed from which the model did not learn.
+Choose junctions and a seed that are not in the model's training.
 
 Examples
 --------
@@ -47,8 +47,8 @@ SCENARIOS: Mapping[str, tuple[str, str]] = {
     "stops": ("stops", "no-hazard"),
     **{kind: (f"{kind}-only", "no-hazard") for kind in ("bicycle", "scooter", "electric")},
 }
-RATE_HZ, WINDOW_S = 6000.0, 1.0  # Of the sound, up to 2 kHz; what a hop reads
-Followed = tuple[PassedStream, BoolArray]  # A stream, and whether the second of each hop holds a gust
+RATE_HZ, WINDOW_S = 6000.0, 1.0  # Sample rate, for sound up to 2 kHz, and the window of a hop
+Followed = tuple[PassedStream, BoolArray]  # A stream, and whether the second of each hop contains a gust
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     model, names = read_model(arguments.model), arguments.names or [*SCENARIOS]
     if arguments.budget is not None:
         model = replace(model, sequence=parts_of(model)[1].asking(budget=arguments.budget))
@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def followed(settings: StreamSettings, model: Model, folder: Path) -> Followed:
-    """Return a stream as the filter follows it, rendered unless it lies in the folder."""
+    """Return a stream with the filter's output, rendered unless it is in the folder."""
     if model.domain is None:
         raise InvalidArgumentError("model: expected one that names its array, got one that names none")
     path, array = folder / f"{settings.name}-{settings.minutes:g}.npz", array_of(model.domain)

@@ -1,23 +1,21 @@
-"""`worldstate-lab streams`: what the whole world-state makes of simulated streams, vehicle by vehicle.
+"""`worldstate-lab streams`: performance of the whole world-state on simulated streams, by vehicle.
 
-Streams that were listened to, as `worldstate model make` keeps them, go through the filter hop by hop, with
-boxes of a camera drawn from their truth. Printed for every junction and for all: approaches warned of and how
-early (from eight seconds before T0 on; from five, too), onsets an hour where no vehicle comes, whether both
-of two are found, whether a vehicle keeps its identity when it comes into view, what is warned of after it has
-passed, how true times and bearings are, and what a meter reaches that measures how much louder it is than the
-place was. Then, of the second vehicle from the other side and of the one behind, by the gap to the first: the
-chance to come within three seconds where it adds a decibel to the sound and where it adds less, and what
-becomes of its entity. How much it adds stands first, last the trade between naming both sides of two and the
-other side of one, and onsets an hour by kind of hazard-free traffic. "worst" is of the junctions with eight
-cases or more. With --days, days are drawn from the streams, with as many false onsets as there are, as the
-budget allows and more: how often the watch calls the budget broken, and after how many hours.
+Streams kept by `worldstate model make` pass through the filter hop by hop, with boxes of a camera drawn from
+their truth. The output has for every junction and for all: announced approaches and their lead (from eight
+seconds before T0 on, and from five), onsets per hour without an approach, detection of both vehicles of a
+pair, kept identities, advisories after the pass, errors of times and bearings, and the performance of a sound
+level meter. For the second vehicle from the other side, and for a follower, it has by the gap to the first:
+the probability to come within three seconds if it adds a decibel to the sound or less, and the result of its
+entity. It also has the added level, the trade between announcing both sides of a pair and the other side of a
+single vehicle, and onsets per hour by kind of hazard-free traffic. "worst" is over junctions with at least
+eight cases. With --days, days are drawn from the streams with their own rate of false onsets, the budgeted
+rate and more: how often the watch reports a broken budget, and after how many hours.
 
---curve MODEL writes the model with the curve from budget to threshold that hazard-free streams have, without
-a camera, and prints some of its points; --promise prints for budgets and shares what the model's curve
-promises and what these hazard-free streams have, those of each renderer by themselves. Neither follows
-vehicles.
+--curve MODEL writes the model with the curve from budget to threshold of hazard-free streams, without a
+camera, and prints some of its points. --promise prints for budgets and shares the promise of the model's
+curve and the result of these hazard-free streams, by renderer. Neither follows vehicles.
 
-The streams must be of other seeds, and for an honest figure of other junctions, than the model learned from.
+The streams must have other seeds and, for a fair figure, other junctions than the model's training.
 
 Examples
 --------
@@ -83,7 +81,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     model, days = read_model(arguments.model), in_range("--days", arguments.days, 0, 100_000)
     if arguments.promise or arguments.curve is not None:
         return _curve(arguments, model)
@@ -115,7 +113,7 @@ BUDGETS, ALPHAS = (6.0, 12.0, 30.0), (0.01, 0.02, 0.05)
 
 
 def _curve(arguments: argparse.Namespace, model: Model) -> CommandResult:
-    """Write the curve of the streams, or hold them against that of the model."""
+    """Write the curve of the streams, or compare them with that of the model."""
     levels: dict[str, list[FloatArray]] = {}
     found = in_processes(partial(_site_levels, model), arguments.streams, arguments.jobs)
     for site, one in track(found, "following", len(arguments.streams)):
@@ -141,9 +139,9 @@ def _site_levels(model: Model, path: Path) -> tuple[str, FloatArray]:
 def promised_and_found(
     sequence: SequenceModel, levels: Mapping[str, Sequence[FloatArray]]
 ) -> dict[str, Figures]:
-    """Return what the curve promises at some budgets and shares, and what the streams of each renderer have.
+    """Return the promises of the curve at some budgets and shares, and the results of each renderer.
 
-    The first letter of a place's name is its renderer's. A found rate has its exact Poisson interval.
+    The first letter of a place's name is its renderer. A rate has its exact Poisson interval.
     """
     rows, groups = dict[str, Figures](), {standing_name(name)[0] for name in levels}
     asked = [("budget", one) for one in BUDGETS] + [("alpha", one) for one in ALPHAS]
@@ -170,7 +168,8 @@ def _figures(streams: Sequence[PassedStream]) -> Figures:
 
 
 FEWEST_CASES = 8
-# By the end of a figure's name: where its cases stand, and whether the least or the most is worst.
+# By the end of a figure's name: the key of its number of cases, and whether the minimum or the maximum is
+# worst.
 _WORST: Mapping[str, tuple[str, Callable[[Iterable[float]], float]]] = {
     **dict.fromkeys(("detected", "detected_5s", "meter_detected"), ("approaches", min)),
     **dict.fromkeys(("skill_1s", "skill_2s", "skill_3s", "kept_after_t0"), ("approaches", min)),
@@ -187,7 +186,7 @@ _WORST: Mapping[str, tuple[str, Callable[[Iterable[float]], float]]] = {
 
 
 def worst_of(junctions: Mapping[str, Figures]) -> Figures:
-    """Return the worst figure of the junctions with eight cases or more, None where that means nothing."""
+    """Return the worst figure over junctions with at least eight cases, None if it is not defined."""
     return {name: _worst(junctions.values(), name) for name in next(iter(junctions.values()))}
 
 

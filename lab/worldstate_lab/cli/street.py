@@ -1,8 +1,8 @@
-r"""`worldstate-lab street`: numbers of the street model, fitted on streams of both renderers.
+r"""`worldstate-lab street`: parameters of the street model, fitted on streams of both renderers.
 
-Rates and shares are counted, spreads are those of the true places about what the model expects, and the rest
-has the largest likelihood of what was true. Numbers of the camera are means of the simulated and the real
-detector; the side is that on which a vehicle was believed when it came into view.
+Rates and shares are counts; spreads are those of the true positions about the expected ones; the others
+maximise the likelihood of the truth. Parameters of the camera are means of the simulated and the real
+detector. The side is that of the entity when the vehicle came into view.
 
 Examples
 --------
@@ -44,19 +44,20 @@ from worldstate_lab.sequences.hearing import ovad_chain
 from worldstate_lab.sequences.recordings import read_recordings
 from worldstate_lab.sequences.tracking import NEAR_RAD
 
-# What a fit reads, of every vehicle, hop or row.
+# Data of a fit, per vehicle, hop or row.
 Facts: TypeAlias = defaultdict[str, list[Any]]
 STREET, SITE = StreetModel(), site_geometry_of(Context(), FilterSettings())
 _GAP_S = 0.35  # Three images without a box end a track
 _LIKELY, _SLACK_S = 0.5, 1e-3
-_ROUNDS, _VALUES = 100, 61  # Of an expectation-maximization, and of a search
-_LAGS = 11  # Hops of the second that a bearing is of
+_ROUNDS, _VALUES = 100, 61  # Rounds of expectation-maximization, and values of a search
+_LAGS = 11  # Hops of the second of a bearing
 
 
 def vehicle_facts(heard: HeardStream, facts: Facts) -> tuple[FloatArray, FloatArray]:
-    """Collect how vehicles come; return azimuths at every hop, NaN without one.
+    """Collect the arrivals of vehicles; return azimuths at every hop, NaN without one.
 
-    Of the next hidden vehicle of each side, shape (n, 2), and of one that is alone in view, shape (n,).
+    The azimuths are of the next hidden vehicle of each side, shape (n, 2), and of a single one in view, shape
+    (n,).
     """
     rows, vehicles, n = heard.rows, heard.vehicles, len(heard.hops)
     hops, inside = heard.row_hops()
@@ -68,7 +69,7 @@ def vehicle_facts(heard: HeardStream, facts: Facts) -> tuple[FloatArray, FloatAr
         entries_s = np.sort(vehicles.entry_s[vehicles.hazard & (vehicles.arm == arm)])
         facts["gap_s"] += np.diff(entries_s, append=np.inf).tolist()
     hazards = np.flatnonzero(vehicles.hazard)
-    for i in hazards[np.argsort(-vehicles.entry_s[hazards])].tolist():  # The next one of a side last
+    for i in hazards[np.argsort(-vehicles.entry_s[hazards])].tolist():  # The next one of a side comes last
         mine, k = inside & (rows.vehicle == vehicles.vehicle[i]), SIDES.index(vehicles.arm[i])
         way, left_s = 1 - 2 * k, vehicles.entry_s[i] - rows.time_s[mine]
         log = np.log(rows.x_m[mine] + 1j * way * rows.y_m[mine])  # log r + i theta
@@ -82,7 +83,7 @@ def vehicle_facts(heard: HeardStream, facts: Facts) -> tuple[FloatArray, FloatAr
 
 
 def stream_facts(path: Path, model: Model, facts: Facts) -> list[Measurement]:
-    """Collect what is true of a stream and what is believed of it; return what was measured."""
+    """Collect the truth of a stream and the beliefs about it; return its measurements."""
     heard, measured = stream_measurements(path, model, "all", 0)
     (hidden_rad, lone_rad), truth, world = vehicle_facts(heard, facts), stream_truth(heard), WorldFilter()
     groups, distant = truth.groups(), [GROUPS.index("rising"), GROUPS.index("falling")]
@@ -111,7 +112,7 @@ def stream_facts(path: Path, model: Model, facts: Facts) -> list[Measurement]:
 
 
 def camera_numbers(recordings: Iterable[Sequence[Measurement]]) -> dict[str, float]:
-    """Return the numbers of a camera by the boxes of some recordings, those that move linked to tracks."""
+    """Return the parameters of a camera from the boxes of recordings; moving boxes form tracks."""
     images, tracks = 0, list[list[AzimuthBox]]()
     for measured in recordings:
         looks = {one.look.stamp_ns: one.sightings for hop in measured for one in hop.looks}
@@ -143,13 +144,13 @@ def _rms(errors: FloatArray) -> float:
 
 
 def _least(loss: Callable[[StreetModel], float], name: str) -> float:
-    """Return the value of a number between a tenth and ten times the one that ships with the least loss."""
+    """Return the value with the smallest loss between a tenth and ten times the shipped one."""
     values = getattr(STREET, name) * np.geomspace(0.1, 10.0, _VALUES)
     return float(min(values.tolist(), key=lambda value: loss(replace(STREET, **{name: value}))))
 
 
 def _mixture(errors: FloatArray, span_rad: float) -> tuple[float, float, float]:
-    """Return share and deviation of normal errors, the rest anywhere in a span, and the likelihood, by EM."""
+    """Return by EM the share and deviation of normal errors, the rest uniform, and the likelihood."""
     share, std = 0.5, 0.1
     for _ in range(_ROUNDS):
         own = share * np.exp(-0.5 * (errors / std) ** 2) / (std * math.sqrt(2.0 * math.pi))
@@ -160,7 +161,7 @@ def _mixture(errors: FloatArray, span_rad: float) -> tuple[float, float, float]:
 
 
 def street_numbers(facts: Facts) -> dict[str, float]:
-    """Return the numbers that follow from the facts of streams."""
+    """Return the parameters that follow from the data of streams."""
     log, rate, moves, gaps_s = (np.array(facts[name]) for name in ("log", "rate", "moves", "gap_s"))
     side = SITE.sides[0]
     comes = moves >= FIRST_BIN
@@ -180,7 +181,7 @@ def street_numbers(facts: Facts) -> dict[str, float]:
         ]
         return -float(np.mean([np.log(one[[0, 1], parts]).sum() for one, parts in after]))
 
-    # Of the times ago at which a vehicle was where its peak is, the likeliest.
+    # The likeliest delay after which the peak is at the vehicle's former azimuth.
     late = [(*_mixture(errors, math.pi), hops) for hops, errors in enumerate(np.array(facts["peak"]).T)]
     seen_path, seen_std, _, hops = max(late, key=itemgetter(2))
     followed = gaps_s <= COMING_S[-1]
@@ -213,7 +214,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     model, facts, real = read_model(arguments.model), Facts(list), list[list[Measurement]]()
     measured = [stream_facts(path, model, facts) for path in track(arguments.streams, "streams")]
     fitted = street_numbers(facts)

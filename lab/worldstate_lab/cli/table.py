@@ -1,30 +1,28 @@
 """`worldstate-lab table`: every row of Table I on a data set, as one report.
 
-Listen to every recording once, then let every method decide: vision alone, radar, track recovery, the
-published acoustic classifier, the proposed method at three budgets, and this library's own advisory. What is
-fitted is fitted on other recordings than it is scored on: five folds, one junction left out with the
-classifier fixed, and with the classifier retrained without it.
+Every recording is processed once, and every method decides on it: vision alone, radar, track recovery, the
+published acoustic classifier, the proposed method at three budgets, and this library's own advisory. Fits use
+other recordings than scores: five folds, one junction left out with the classifier fixed, and with the
+classifier retrained without it.
 
 DATASET is a folder in OVAD's layout: the real data set, or recordings of your own with DataLog.csv. Without
-one, streets are simulated into OUT/streets (12 GB) and the report says so. The tested recordings are those
-of the official lists where they lie in the folder (or --static-ids, --dynamic-ids), else all.
+one, streets are simulated into OUT/streets (12 GB), and the report states it. The tested recordings are those
+of the official lists if they are in the folder (or --static-ids, --dynamic-ids), else all.
 
-The published classifier is trained on --features, a table of windows such as the released one, whose windows
-of tested recordings are left out; else on the recordings that are not tested; on simulated streets on other
+The published classifier is trained on --features, a table of windows such as the released one, without
+windows of tested recordings; else on the recordings that are not tested; on simulated streets on other
 simulated recordings; else on the calibration recordings of each fold.
 
-OUT/report.md holds every table and figure beside the paper's, OUT/report_files the same as PNG and CSV.
+OUT/report.md has every table and figure beside the paper's, OUT/report_files the same as PNG and CSV.
 
-Streets are kept, and what was heard is in OUT/cache by the content of each recording: an interrupted run
-goes on where it stopped, and a second one takes a minute. Least data: two approaches and two hazard-free
-recordings, and for leaving junctions out two junctions that have both; what a protocol lacks is said before
-anything is heard.
+Streets are kept, and OUT/cache has the results by the content of each recording: an interrupted run
+continues, and a second one takes a minute. The minimum is two approaches and two hazard-free recordings, and
+for leaving junctions out two junctions with both; the requirements of a protocol are checked first.
 
---stage-streams lets camera and rain fail on the streams of --hazard-free as well, and prints advisories an
-hour in every state beside those of the clean camera, on the same minutes: half an hour for each hour.
+--stage-streams also degrades camera and sound on the streams of --hazard-free, and prints advisories per hour
+in every state beside those of the clean camera, on the same minutes: half an hour for each hour.
 
-A recording that cannot be heard is named and left out. Rows of a model that was not made for the array of the
-recordings are named and not scored.
+Unreadable recordings, and rows of a model for another array, are listed and not scored.
 
 Examples
 --------
@@ -85,7 +83,7 @@ SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 6.0
 # Images of OVAD's size take more than half of the time of a simulated recording.
 SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5
-# Where the work is done and what is printed of it.
+# Options for the place of work and the printed output.
 _NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "against", "seeds")
 COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
 SHOWN = ("lead_s", "detection", "random_detection", "bearing_deg")
@@ -114,7 +112,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     _check(arguments)
     output_folder(arguments.out, "evaluation.json")
     takes = _takes(arguments)
@@ -147,10 +145,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def _degradation(
     arguments: argparse.Namespace, classifiers: Classifiers, takes: TakeList
 ) -> DegradationSettings:
-    """Return the sweep over camera states; in a smoke test of one detector on small images.
+    """Return the sweep over camera states; in a smoke test with one detector on small images.
 
-    It listens with --model, else with the model that ships, and where that was not made for this sound with
-    one that is trained on the training windows.
+    It uses --model, else the shipped model, and for another array a model that is trained on the training
+    windows.
     """
     detectors, model, seed = motion_detectors(), arguments.model, arguments.seed
     foreign = any(_is_foreign(take) for take in takes.static if take.filmed)
@@ -167,11 +165,11 @@ def _degradation(
 
 
 def _is_foreign(take: Take) -> bool:
-    """Tell whether the model that ships was not made for the sound of a recording."""
+    """Return whether the shipped model does not apply to the sound of a recording."""
     try:
         return model_refusal(take, read_model(None)) is not None
     except InputFileError:
-        # What cannot be heard is named and left out when all recordings are listened to.
+        # Unreadable recordings are listed when all recordings are processed.
         return False
 
 
@@ -184,7 +182,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _configuration(arguments: argparse.Namespace) -> list[tuple[str, str]]:
-    """Return the options that figures may depend on, as they were given or by default."""
+    """Return the options that figures may depend on, given or by default."""
     names = [name for name in vars(arguments) if name not in _NO_FIGURE]
     return [(f"--{name.replace('_', '-')}", _told(getattr(arguments, name))) for name in names]
 
@@ -203,13 +201,13 @@ def _compared(arguments: argparse.Namespace) -> Sequence[Comparison]:
 
 
 def _difference(one: Comparison) -> dict[str, object]:
-    """Return JSON-able values; a figure that neither evaluation has is left out."""
+    """Return JSON-compatible values without figures that neither evaluation has."""
     known = {name: values for name, values in one.differences.items() if values[0] == values[0]}
     return {"protocol": one.protocol, "method": one.method, "shared": one.shared, "differences": known}
 
 
 def _against_lines(compared: Sequence[Comparison]) -> list[str]:
-    """Return the differences of the main figures to the other evaluation, with their intervals."""
+    """Return the differences of the main figures from the other evaluation, with their intervals."""
     rows: list[tuple[Cell, ...]] = [
         (one.protocol, one.method, one.shared, *(Value(*one.differences[name]) for name in COMPARED))
         for one in compared
@@ -232,20 +230,20 @@ def _takes(arguments: argparse.Namespace) -> TakeList:
 
 
 def _check_model(model: Path, dataset: Path | None) -> None:
-    """Refuse a model that was made for another array: every row of it would be of no meaning."""
+    """Refuse a model for another array, whose rows would have no meaning."""
     domain = read_model(model).domain
     if domain is not None:
-        # Streets are simulated with OVAD's array: a mismatch is found before, not after a quarter of an hour.
+        # Streets are simulated with OVAD's array: a mismatch is found before a quarter of an hour of work.
         check_array(domain, ovad_array() if dataset is None else choose_array(dataset))
 
 
 def _simulated(arguments: argparse.Namespace) -> Path:
-    """Simulate the streets that are not there yet, or are of other settings."""
+    """Simulate the streets that are missing or have other settings."""
     from worldstate.simulation.dataset.dataset import DatasetSettings
 
     root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
-    # A moving ego has no video: its camera moves, and every box with it.
+    # A moving ego has no video, because its camera moves, and every box with it.
     streets = DatasetSettings(static, seed=arguments.seed, duration_s=length_s, video=True)
     parts = [replace(streets, video_width_px=SMOKE_VIDEO_PX) if arguments.smoke else streets]
     if dynamic:
@@ -263,7 +261,7 @@ def _classifiers(arguments: argparse.Namespace, takes: TakeList) -> Classifiers:
     if arguments.features is not None:
         return Classifiers(*windows.windows_from_table(arguments.features, takes))
     found = windows.windows_from_recordings(takes, folder)
-    # Windows are simulated with OVAD's array: those of another one would teach another feature.
+    # Windows are simulated with OVAD's array; those of another array would be another feature.
     usual = microphone_order(ovad_array().positions_m, choose_array(takes.root)) is not None
     if found is None and takes.simulated and usual:
         count = SMOKE_WINDOWS if arguments.smoke else windows.PER_APPROACH

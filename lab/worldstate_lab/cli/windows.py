@@ -1,31 +1,29 @@
-"""`worldstate-lab windows`: how well signature and cueing do on labelled feature windows.
+"""`worldstate-lab windows`: performance of signature and cueing on labelled feature windows.
 
 Evaluate a signature classifier and its cueing on labelled feature windows.
 
-  --protocol cv        5 folds by recording, stratified by label and junction
-  --protocol lojo      leave one junction out
-  --protocol transfer  learn on windows of a standing ego, predict those of --group
+--protocol cv        5 folds by recording, stratified by label and junction --protocol lojo      leave one
+junction out --protocol transfer  train on windows of a standing ego, predict those of --group
 
   --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right).
-                       The row baseline_absent is of eq. (6) with the visible explanation removed
-  --method worldstate  windows compared with what their site sounds like; mirror-symmetric ensemble; eq. (6)
-                       with the visible explanation removed. "rows" and "gains" compare it with the baseline,
-                       with the untrained loudest direction, and with itself under the other references.
-                       Under transfer it is one expert of the pattern above the site's quiet windows, its
-                       risks shifted until hazards are as frequent as in training, and the ensemble a row
+                       The row baseline_absent is eq. (6) without the visible explanation
+  --method worldstate  windows relative to the average of their site; mirror-symmetric ensemble; eq. (6)
+                       without the visible explanation. "rows" and "gains" compare it with the baseline,
+                       with the untrained loudest direction, and with itself under the other references. Under
+                       transfer it is one expert of the pattern above the site's quiet windows, its risks shifted until
+                       hazards are as frequent as in training, and the ensemble is a row
 
-  --reference run      as `run` has it: learned from the ten windows of a second that came before, drawn from
-                       other recordings of the junction, one in twenty of them a hazard; no label is read
+  --reference run      as in `run`: learned from the ten preceding windows of a second, drawn from other
+                       recordings of the junction, one in twenty of them a hazard; no label is used
   --reference cold     the mean of the training sites: a car in its first second
   --reference curated  all windows of the junction's other recordings, half of them hazards: no car has it
 
-Thresholds and risk maps are set on inner out-of-fold scores of windows compared as the scored ones are, under
-`run` with five drawn streams, as in `model fit`.
-Figures are means over the seeds; intervals are the middle 95 % of 500 bootstrap samples of recordings, the
-same for every method.
+Thresholds and risk maps are set on inner out-of-fold scores of windows with the same reference as the scored
+ones, under `run` with five drawn streams, as in `model fit`. Figures are means over the seeds; intervals are
+the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
 
-With --model a finished model is evaluated instead; it is refused where it was trained on these recordings.
-Keys that end in _absent are of eq. (6) with the visible explanation removed.
+--model evaluates a finished model; it is refused if it was trained on these recordings. Keys that end in
+_absent are of eq. (6) without the visible explanation.
 
 Examples
 --------
@@ -73,7 +71,7 @@ from worldstate_lab.metrics.intervals import (
     worst_rate,
 )
 
-# The floor belongs to the risks: another seed in every run would only add noise to it.
+# The floor belongs to the risks: another seed per run would only add noise.
 FLOOR_SEED = 0
 Figures = dict[str, float | None]
 DEVIATING = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "fpr", "ece")
@@ -96,8 +94,8 @@ def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
 
 
 def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray], Figures]:
-    """Return what forms the figures of some rows: hazard windows against hazard-free ones."""
-    # `front` counts in the 4-class accuracy only.
+    """Return a function from rows to their figures: hazard windows against hazard-free ones."""
+    # `front` is used in the 4-class accuracy only.
     hazards, hazard_free, correct = table.hazards, table.hazard_free, one.classes == table.labels
     sites = np.unique(table.environments, return_inverse=True)[1]
 
@@ -121,7 +119,7 @@ def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray],
 
 
 def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArray) -> Figures:
-    """Return accuracy, area and rates of one junction; None where a label is missing there."""
+    """Return accuracy, area and rates of one junction; None if a label is missing there."""
     scored = here & (table.hazards | table.hazard_free)
     return {
         "accuracy": mean_of((predictions.classes == table.labels)[here]),
@@ -146,7 +144,7 @@ def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> d
 
 
 def count_windows(table: FeatureTable) -> dict[str, int]:
-    """Return the numbers of windows, by what they hold, and of recordings."""
+    """Return the numbers of windows by class, and of recordings."""
     return {
         "n_windows": len(table),
         "n_hazard": int(table.hazards.sum()),
@@ -156,7 +154,7 @@ def count_windows(table: FeatureTable) -> dict[str, int]:
 
 
 def mean_figures(figures: Sequence[Figures]) -> Figures:
-    """Return the mean of each figure, None where it could not be had.
+    """Return the mean of each figure, None if it is not defined.
 
     Examples
     --------
@@ -172,7 +170,7 @@ def mean_figures(figures: Sequence[Figures]) -> Figures:
 def write_predictions(
     path: str | Path, table: FeatureTable, passes: Sequence[Predictions], seeds: Sequence[int]
 ) -> None:
-    """Write one row a window and seed, whole or not at all; floats as they are, to the last digit."""
+    """Write one row per window and seed, completely or not at all, with exact floats."""
     rows: list[list[object]] = []
     for seed, one in zip(seeds, passes, strict=True):
         about = one.folds, table.recordings, table.environments, table.labels
@@ -192,7 +190,7 @@ def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[st
     return figures
 
 
-# The same samples for every method and run: the differences between methods are paired.
+# The same samples for every method and run, so that differences between methods are paired.
 BOOTSTRAP_SEED = 0
 
 
@@ -208,7 +206,7 @@ def run_passes(
     jobs: int = 1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> dict[str, Passes]:
-    """Run every seed of every method; the outcome does not depend on the number of jobs."""
+    """Run every seed of every method; the result does not depend on the number of jobs."""
     known = methods(simulated)
     tasks = [(name, seed) for name in names for seed in range(seeds)]
     run = delayed(evaluate_pass)
@@ -225,25 +223,25 @@ def run_passes(
 def comparison(
     table: FeatureTable, passes: Mapping[str, Passes], row: str, alpha: float, draws: int = DRAWS
 ) -> dict[str, Any]:
-    """Return the figures of one row, those of all others, and what the one gains on each.
+    """Return the figures of one row, those of all others, and its gains over each.
 
     Parameters
     ----------
     table : FeatureTable
-        Windows that were predicted.
+        Predicted windows.
     passes : mapping of str to list
         From `run_passes`.
     row : str
-        Name in `ROWS` of the one that the plain keys are of.
+        Name in `ROWS` of the row of the plain keys.
     alpha : float
         Budget, for the test of the achieved false-positive rate.
     draws : int
-        Bootstrap samples behind the intervals.
+        Number of bootstrap samples.
 
     Raises
     ------
     InvalidArgumentError
-        If there are no passes of that row's method.
+        If that row's method has no passes.
 
     Returns
     -------
@@ -296,7 +294,7 @@ def _row_figures(
 ) -> dict[str, Any]:
     figures = mean_figures([window_figures(table, one) for one in passes])
     n = int(table.hazard_free.sum())
-    # Probability of as many false positives or more, were the true rate the budget.
+    # Probability of at least as many false positives if the true rate is the budget.
     p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
     return {
         **figures,
@@ -309,7 +307,7 @@ def draw_figures(
     table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[IndexArray]
 ) -> dict[str, FloatArray]:
     """Return the figures on every bootstrap sample of recordings, mean over the passes (seeds)."""
-    # The mean ECE of bootstrap samples lies above that of the sample itself: read its interval as a width.
+    # The mean ECE of bootstrap samples is larger than that of the sample: use its interval as a width.
     measures = [_figures_on(table, one) for one in passes]
     found = [[measure(rows) for rows in samples] for measure in measures]
     draws = {name: [[one[name] for one in mine] for mine in found] for name in found[0][0]}
@@ -317,7 +315,7 @@ def draw_figures(
 
 
 Report = dict[str, Any]
-# What fits a line of the table; the JSON object has the gains of all figures.
+# Gains in the table; the JSON object has all of them.
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
 
 
@@ -338,7 +336,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     check_outputs(arguments, "predictions")
     whole = read_features(arguments.table)
     table = whole.group(arguments.group)
@@ -364,7 +362,7 @@ def _evaluate_method(
 def _passes(
     arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable, row: str
 ) -> dict[str, Passes]:
-    """Run every seed of the method and of those that it is compared with."""
+    """Run every seed of the method and of its peers."""
     in_range("--seeds", arguments.seeds, 1, 10_000)
     afar = arguments.protocol == "transfer"
     if afar and arguments.group != "dynamic":
@@ -407,7 +405,7 @@ def _origin(arguments: argparse.Namespace, method: str, protocol: str, seeds: in
 
 
 def _flat(figures: Report) -> dict[str, object]:
-    """One line a junction and one a compared row, for people."""
+    """Return one line per junction and per compared row, as text."""
     flat = {key: value for key, value in figures.items() if not isinstance(value, dict)}
     intervals = figures.get("intervals", {})
     for key, (low, high) in intervals.items():

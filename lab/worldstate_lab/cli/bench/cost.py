@@ -1,9 +1,9 @@
-"""`worldstate-lab bench`: what front-end and filter cost on this machine, beside their peers.
+"""`worldstate-lab bench`: costs of front-end and filter on this machine, beside their peers.
 
-56 channels, 47,998 Hz, nfft 512, half overlap, BLAS pinned to one thread. Milliseconds are the median over
-rounds of the median (and 99th percentile) over hops. The sound is a broadband source and an engine line in
-noise as loud as the source. --files prints the files of the library that one hop of the whole chain
-executes, and how many calls it makes.
+56 channels, 47,998 Hz, nfft 512, half overlap, one BLAS thread. Milliseconds are the median over rounds of
+the median (and 99th percentile) over hops. The sound is a broadband source and an engine line in noise of the
+same level as the source. --files prints the files of the library that one hop of the whole chain executes,
+and its number of calls.
 
 example: worldstate-lab bench
 """
@@ -51,7 +51,7 @@ from worldstate_lab.benchmarks.hop_costs import (
 from worldstate_lab.benchmarks.tracker_costs import tracker_times
 
 SECONDS = 6
-# Running seconds are full after ten hops, and caches warm.
+# Running seconds are full after ten hops, and caches are warm.
 WARM_UP_HOPS = 11
 EIGHT = slice(None, None, 7)  # Microphones of the roof array
 EVERYTHING = FrontEndSettings(tone_band_hz=ENGINE_BAND_HZ, character=True)
@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def report_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return the report for people."""
+    """Return the report as text."""
     blas, rounds = ", ".join(report["blas"]), report["rounds"]
     lines = [f"BLAS {blas}; 1 thread; median of {rounds} rounds; load {report['load']:.1f}; ms per hop"]
     for name, one in report["costs"].items():
@@ -129,7 +129,7 @@ def report_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def _source(rng: np.random.Generator) -> Float32Array:
-    """Make a plane wave of unit power and an engine line of a tenth of that, (n, 56): 2 s."""
+    """Return a plane wave of unit power and an engine line of a tenth of it, (n, 56): 2 s."""
     n = 2 * RATE_HZ
     frequencies = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
     wave = np.fft.rfft(rng.standard_normal(n))
@@ -172,7 +172,7 @@ def _hops(sound: Float32Array) -> list[Float32Array]:
 def processed(
     hops: list[Float32Array], settings: FrontEndSettings
 ) -> tuple[list[Callable[[], object]], list[AcousticFrame]]:
-    """Return calls of `FrontEnd.process`, what a user gets, every check included, and what they will hear."""
+    """Return calls of `FrontEnd.process` with every check, and their input."""
     front_end, heard = FrontEnd(roof_array_56(), RATE_HZ, settings), list[AcousticFrame]()
 
     def process(samples: Float32Array) -> None:
@@ -193,13 +193,13 @@ def listener_times(hops: Sequence[Float32Array], array: MicrophoneArray) -> Mill
 
 
 def live_times(hops: Sequence[Float32Array]) -> Milliseconds:
-    """Time `worldstate live` with a camera and the terminal's view, from the last block of a hop on."""
+    """Time `worldstate live` with a camera and the terminal view, from the last block of a hop on."""
     listener, detector = Listener(open_source("microphones", array=ovad_array()), RATE_HZ), MotionDetector()
     screen, street = Console(file=io.StringIO(), force_terminal=True), np.full((304, 968, 3), 90, np.uint8)
     times: Milliseconds = []
     for number, hop in enumerate(hops, start=1):
         early, last = np.split(hop, [-block_samples(RATE_HZ)])
-        for _ in listener.steps(early):  # none ends in it
+        for _ in listener.steps(early):  # No hop ends in it
             pass
         image = street.copy()
         image[100:250, 10 * number % 800 :][:, :150] = 220
@@ -215,9 +215,9 @@ def live_times(hops: Sequence[Float32Array]) -> Milliseconds:
 
 
 def executed_files(street: Float32Array) -> tuple[list[str], int]:
-    """Return the files of the library that a hop executes, and the calls that it makes, of Python and of C.
+    """Return the files of the library that a hop executes, and its number of Python and C calls.
 
-    The most files of the last ten hops and the median of their calls, sound to JSON, with a box in view.
+    Files are the maximum over the last ten hops and calls their median, sound to JSON, with a box in view.
     """
     listener = Listener(open_source("microphones", array=ovad_array()), RATE_HZ)
     box = DetectionFrame(np.array([[700.0, 500.0, 900.0, 700.0]]), np.array([0.9]), ("car",))
@@ -226,7 +226,7 @@ def executed_files(street: Float32Array) -> tuple[list[str], int]:
     def follow(frame: FrameType, event: str, _: object) -> None:
         calls[0] += event in ("call", "c_call")
         module = str(frame.f_globals.get("__name__"))
-        # Generated code, as that of dataclasses, stands in no file.
+        # Generated code, such as that of dataclasses, has no file.
         if event == "call" and module.startswith("worldstate.") and frame.f_code.co_filename.endswith(".py"):
             passed[0].add(module.replace(".", "/") + ".py")
 
@@ -253,7 +253,7 @@ def _report(runs: list[Mapping[str, Milliseconds]], kernels: tuple[str, ...]) ->
     return {
         "blas": kernels,
         "rounds": len(runs),
-        "load": os.getloadavg()[0],  # Of the machine over the last minute, at the end
+        "load": os.getloadavg()[0],  # Load of the machine over the last minute, at the end
         "settings": SETTINGS,
         "costs": costs,
         "ratios": {peer: costs[peer]["median_ms"] / costs[one]["median_ms"] for peer, one in pairs},

@@ -1,9 +1,8 @@
 """`worldstate-lab bench gospa`: GOSPA on bearing of the world-state beside trackers, on streams.
 
-Streams that were listened to (`worldstate model make` keeps them) are followed hop by hop. Cut off at 60
-degrees, p = 1, alpha = 2. Hidden are vehicles that come into view within five seconds, visible those in line
-of sight and in the image. Every method states both. The world-state does so itself; of a tracker, which
-models no occlusion, a track where the stream's boxes stand is visible.
+Streams kept by `worldstate model make` are followed hop by hop. Cut-off 60 degrees, p = 1, alpha = 2. Hidden
+vehicles come into view within five seconds; visible ones are in line of sight and in the image. Every method
+gives both. A tracker has no occlusion model: its tracks in the sector of the boxes are visible.
 
 example: worldstate-lab bench gospa streams/S??-*.npz --seconds 120
 """
@@ -49,8 +48,8 @@ Said = dict[str, tuple[Sequence[float], Sequence[float]]]
 def stated(
     heard: HeardStream, measured: Iterable[Measurement], start: WorldFilter
 ) -> Iterator[tuple[int, Said]]:
-    """Yield the number of every hop of a stream, in tenths of a second, and what every method states."""
-    # Optional: only this benchmark needs Stone Soup.
+    """Yield the number of every hop of a stream, in tenths of a second, and the output of every method."""
+    # Optional: this benchmark alone needs Stone Soup.
     from worldstate_lab.benchmarks.tracker_costs import GmPhd, Jpda, scan_time, scans
 
     taken = list(measured)
@@ -75,7 +74,7 @@ def stated(
 
 
 def _view(measured: Sequence[Measurement]) -> tuple[float, float]:
-    """Return the sector in which boxes stand, from right to left, known beforehand to the trackers."""
+    """Return the sector of the boxes, from right to left, which the trackers are given."""
     azimuths = [box.azimuth_rad for one in measured for box in one.sightings]
     right, left = np.quantile(azimuths or [0.0], [0.01, 0.99])
     return float(right), float(left)
@@ -88,13 +87,13 @@ def _unheard(one: Measurement) -> Measurement:
 
 
 def _by_phase(state: WorldState) -> tuple[list[float], list[float]]:
-    """Return the azimuths believed hidden, to come within five seconds, and those believed in view."""
-    # A cue states a time where a vehicle is likelier than not to come within five seconds.
+    """Return the azimuths of hidden vehicles that come within five seconds, and of those in view."""
+    # A cue has a time if a vehicle is more likely than not to come within five seconds.
     coming_s = {cue.direction: cue.time_to_visible_s[1] for cue in state.cues if cue.time_to_visible_s}
     there = [one for one in state.entities if one.existence_probability >= EXISTS]
     hidden = [one for one in there if one.status == "hidden"]
     soon = [one for one in hidden if coming_s.get(str(one.direction), math.inf) <= LONGEST_LEAD_S]
-    # A vehicle that has left the view is kept for some seconds; the camera is not asked about it.
+    # A vehicle that has left the view is kept for some seconds without queries to the camera.
     seen = [one for one in there if one.status != "hidden" and one.visibility.answer != "unqueried"]
     return [one.azimuth_rad for one in soon], [one.azimuth_rad for one in seen]
 
@@ -105,7 +104,7 @@ def _by_place(azimuths: Sequence[float], view: tuple[float, float]) -> tuple[lis
 
 
 def _oc_sort(heard: HeardStream) -> list[list[float]]:
-    """Return the azimuths of the tracks that OC-SORT emits, image by image."""
+    """Return the azimuths of the tracks of OC-SORT, image by image."""
     sort, camera = OcSort(), PinholeCamera.ovad()
     emitted = []
     for frame in stream_detections(heard, np.random.default_rng(0)).frames:
@@ -139,7 +138,7 @@ def _parts_deg(estimates: tuple[float, ...], truths: tuple[float, ...]) -> Float
 
 
 def costs(heard: HeardStream, measured: Iterable[Measurement], start: WorldFilter) -> Costs:
-    """Return every method's summed costs by phase and part, degrees, and the hops with a vehicle."""
+    """Return the summed costs of every method by phase and part, degrees, and the hops with a vehicle."""
     truths, summed = true_azimuths(heard), dict[str, FloatArray]()
     hops = np.zeros(len(PHASES))
     for hop, said in stated(heard, measured, start):
@@ -166,7 +165,7 @@ def report_of(paths: Sequence[Path], model: Model, seconds: float) -> dict[str, 
     found: dict[str, dict[str, dict[str, Row]]] = defaultdict(dict)
     for (name, method), cost in sorted(summed.items(), key=lambda one: one[0][0]):
         total = cost.sum(axis=1)
-        # Hidden ones beside what silence costs, visible ones beside what a tracker of boxes does.
+        # Hidden vehicles relative to silence, visible ones relative to a tracker of boxes.
         beside = [summed[name, SILENCE][0].sum(), summed[name, OC_SORT][1].sum()]
         found[name][method] = {
             phase: {
@@ -187,7 +186,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the benchmark; return what it found."""
+    """Run the benchmark; return its result."""
     found = report_of(arguments.streams, read_model(arguments.model), arguments.seconds)
     junctions, lines = [name for name in found if name != "all"], []
     for k, phase in enumerate(PHASES):

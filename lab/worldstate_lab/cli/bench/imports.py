@@ -1,6 +1,6 @@
-"""`worldstate-lab bench import`: how long the imports take.
+"""`worldstate-lab bench import`: duration of the imports.
 
-Each statement in a fresh interpreter, best of several: seconds of wall and of processor.
+Each statement runs in a new interpreter; the best of several runs gives seconds of wall and processor time.
 
 example: worldstate-lab bench import
 """
@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the benchmark; return seconds of wall and of processor by statement."""
+    """Run the command; return seconds of wall and processor time by statement."""
     return CommandResult({statement: _best_s(statement, arguments.rounds) for statement in STATEMENTS})
 
 

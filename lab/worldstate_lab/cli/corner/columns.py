@@ -1,14 +1,14 @@
-"""`worldstate-lab columns`: how far what a sequence reads in simulated streams is from real recordings.
+"""`worldstate-lab columns`: distance of the simulated inputs of a sequence from real recordings.
 
-FOLDER holds real recordings of a corner in the layout of `worldstate-lab sequences`. Streams in --streams
-were heard by the array of --path, on `seven` by all 56 microphones: levels and bands do not depend on that,
-evidence, prominence and bearing do. Streams whose names begin alike are of one renderer; a few junctions of
-each are enough, and the work grows with the square of their excerpts. Window evidence of streams that --model
-learned is too good.
+FOLDER has real recordings of a corner in the layout of `worldstate-lab sequences`. Streams in --streams have
+the array of --path; for `seven` they have all 56 microphones, which changes evidence, prominence and bearing
+but not levels and bands. Streams whose names begin alike belong to one renderer; a few junctions of each are
+enough, and the work grows with the square of their excerpts. Window evidence on streams that --model learned
+is too good.
 
-A row a column: the squared energy distance of real junctions from one another, of the halves of one of
-them (zero but for chance), and of simulated junctions from real ones, with the ratio of the distances.
---statistics adds medians and quartiles of every statistic.
+Each row is one column: the squared energy distance of real junctions from one another, of the halves of one
+of them (chance), and of simulated junctions from real ones, with the ratio of the distances. --statistics
+adds medians and quartiles of every statistic.
 
 Examples
 --------
@@ -53,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     recordings = read_recordings(arguments.folder)
     if len({one.junction for one in recordings}) < 2:
         raise InvalidArgumentError("recordings: expected two junctions or more")

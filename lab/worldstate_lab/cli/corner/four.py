@@ -1,18 +1,18 @@
-"""`worldstate-lab four`: road users behind corners on a board of four microphones, heard by the product.
+"""`worldstate-lab four`: the product on real road users behind corners, with a board of four microphones.
 
-FOLDER holds truth.csv (file, site, side, kind, seconds) and the recordings; MODEL was made for the board. No
-time of coming into view is known, and outdoors recordings run on past it. So three things are asked:
+FOLDER has truth.csv (file, site, side, kind, seconds) and the recordings; MODEL was made for the board. The
+time of coming into view is unknown, and outdoor recordings continue after it. Three questions are evaluated:
 
-- the side of each vehicle outdoors by the second half of its recording: the one whose published risk has the
-  larger mean; beside it the side by the window's log ratios, and by the sign of the surest 16 % of the
-  bearings, which need no model; and each of these over the hops until the loudest one, since in many second
-  halves the vehicle has passed and drives away on the other side;
+- the side of each vehicle outdoors in the second half of its recording: the side with the larger mean
+  published risk; for comparison, the side by the window's log ratios and by the sign of the surest 16 % of
+  the bearings, which need no model; and each of these over the hops until the loudest one, because in many
+  second halves the vehicle has passed and drives away on the other side;
 - the area under the ROC curve of 1 - P(none) of the hops in the last two seconds against those in the first
-  two of the same recording, its mean over recordings of 5 s and more;
+  two of the same recording, averaged over recordings of 5 s and more;
 - advisories by kind: one for a person is a failure of the guard.
 
-Some channels of these recordings are whole buffers of 1024 samples early. That is read from the sound alone,
-and the channels are aligned; figures of the recordings as they are stand beside (`as_recorded`).
+Some channels of these recordings are early by whole buffers of 1024 samples. The offsets are estimated from
+the sound alone, and the channels are aligned; figures without alignment are given as `as_recorded`.
 
 Carts, and recordings without a side, are listed and not scored.
 
@@ -49,9 +49,9 @@ from worldstate_lab.metrics.intervals import highest_share, stratified_draws
 from worldstate_lab.report.table import MISSING, Table, Value, cell_text
 
 BUFFER = 1024
-# Of the sound that is compared for lost buffers: wind below, little sound of vehicles above.
+# Band of the comparison for lost buffers: wind below, little sound of vehicles above.
 _BAND_HZ = (200.0, 6000.0)
-# Share of the bearings that the paper calls the surest.
+# Share of the bearings that the paper uses as the surest.
 _SUREST = 0.16
 _ENDS_S, _LEAST_S = 2.0, 5.0
 _PERSONS = ("human", "man", "woman")
@@ -62,7 +62,7 @@ _SINCE_HALF, _UNTIL_LOUDEST = "second half", "until the loudest hop"
 
 @dataclass(frozen=True, slots=True)
 class BoardRecording:
-    """One recording, and what is known of it."""
+    """One recording and its truth."""
 
     path: Path
     site: str
@@ -76,7 +76,7 @@ class BoardRecording:
 
     @property
     def scored(self) -> bool:
-        """Whether a side and a kind that is heard in streets are known."""
+        """Whether it has a side and a kind that occurs in streets."""
         return self.side in SIDES and self.kind not in _UNSCORED
 
     @property
@@ -87,12 +87,12 @@ class BoardRecording:
 
 @dataclass(frozen=True, slots=True)
 class BoardOutcome:
-    """What the product made of a recording."""
+    """Output of the product for a recording."""
 
     recording: BoardRecording
     hops: int
-    buffers: tuple[int, ...]  # Lost by each channel
-    sides: Mapping[str, str | None]  # By what they are read from, and in which hops
+    buffers: tuple[int, ...]  # Lost buffers of each channel
+    sides: Mapping[str, str | None]  # By source of the side and by hops
     rise: float | None  # AUROC of the last two seconds against the first two
     advised: bool
 
@@ -107,13 +107,13 @@ def read_board(folder: Path) -> list[BoardRecording]:
 
 
 def lost_buffers(sound: Float32Array, sample_rate_hz: float) -> tuple[int, ...]:
-    r"""Return how many buffers each channel (n, M) lost before the sound began, at least 0.
+    r"""Return the number of buffers that each channel (n, M) lost before the sound began, at least 0.
 
-    The peak of the cross-correlation with the first channel, phases alone,
+    It is the peak of the cross-correlation with the first channel, phases alone,
 
     .. math:: \hat\tau_m = \arg\max_\tau \Big| \sum_f \frac{X_m X_0^*}{|X_m X_0|} e^{2 \pi j f \tau} \Big|
 
-    in whole buffers: a board of centimetres delays sound by a few samples.
+    in whole buffers, because a board of centimetres delays sound by a few samples only.
     """
     n = 2 * len(sound)
     spectra = np.fft.rfft(sound, n, axis=0)
@@ -127,14 +127,14 @@ def lost_buffers(sound: Float32Array, sample_rate_hz: float) -> tuple[int, ...]:
 
 
 def aligned(sound: Float32Array, buffers: Sequence[int]) -> Float32Array:
-    """Give every channel (n, M) the time of the one that lost the fewest buffers."""
+    """Align every channel (n, M) with the channel that lost the fewest buffers."""
     starts = BUFFER * (max(buffers) - np.array(buffers))
     length = len(sound) - int(starts.max())
     return np.stack([sound[at : at + length, m] for m, at in enumerate(starts.tolist())], axis=1)
 
 
 def heard(recording: BoardRecording, model: Model, array: Path | None, *, align: bool) -> BoardOutcome:
-    """Hear one recording by the whole product, without a camera."""
+    """Run one recording through the whole product, without a camera."""
     source = open_source(recording.path, array=array, model=model)
     with open_sound(recording.path, source.array.n_microphones) as audio:
         rate_hz = audio.sample_rate_hz
@@ -163,7 +163,7 @@ def outcome(
 
 
 def _side(leftwards: FloatArray) -> str | None:
-    """Return the side that numbers a hop speak for in the mean, left positive; None of none."""
+    """Return the side of the mean of the values per hop, left positive; None without values."""
     mean = float(np.nansum(leftwards))
     return None if mean == 0.0 else SIDES[0] if mean > 0.0 else SIDES[1]
 
@@ -189,12 +189,12 @@ def _of_bearing(steps: Sequence[Step]) -> str | None:
 _READ = {"risk": _of_risk, "window": _of_window, "bearing": _of_bearing}
 
 
-# What the side is scored by; the others stand beside it.
+# The scored side; the others are for comparison.
 _MAIN = f"risk, {_SINCE_HALF}"
 
 
 def run_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> dict[str, Any]:
-    """Return the figures of all recordings that were heard."""
+    """Return the figures of all recordings."""
     scored = [one for one in outcomes if one.recording.scored]
     cars = [one for one in scored if one.recording.drives_outdoors]
     persons = [one for one in scored if one.recording.kind in _PERSONS]
@@ -210,7 +210,7 @@ def run_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> d
 
 
 def _by(what: str, outcomes: Sequence[BoardOutcome]) -> dict[str, list[BoardOutcome]]:
-    """Sort outcomes by an attribute of their recordings."""
+    """Group outcomes by an attribute of their recordings."""
     found: dict[str, list[BoardOutcome]] = {}
     for one in sorted(outcomes, key=attrgetter(f"recording.{what}")):
         found.setdefault(getattr(one.recording, what), []).append(one)
@@ -218,7 +218,7 @@ def _by(what: str, outcomes: Sequence[BoardOutcome]) -> dict[str, list[BoardOutc
 
 
 def counts(outcomes: Sequence[BoardOutcome]) -> Figures:
-    """Return a group in counts: with an advisory, on the right side, with more hazard at the end."""
+    """Return the counts of a group: with an advisory, on the right side, with more hazard at the end."""
     rises = _rises(outcomes)
     return {
         "count": len(outcomes),
@@ -240,7 +240,7 @@ def _rises(outcomes: Sequence[BoardOutcome]) -> FloatArray:
 
 
 def side_figures(outcomes: Sequence[BoardOutcome], form: str) -> dict[str, Any]:
-    """Return how often the side is right, with exact intervals, and the mean of the recalls of both sides."""
+    """Return the share of right sides, with exact intervals, and the mean recall of both sides."""
     shares = {name: _share(_right(some, form), len(some)) for name, some in _by("side", outcomes).items()}
     whole = _share(_right(outcomes, form), len(outcomes))
     return {**whole, "balanced": _balanced([one["share"] for one in shares.values()]), "by_side": shares}
@@ -252,7 +252,7 @@ def _share(count: int, of: int) -> dict[str, Any]:
 
 
 def _balanced(by_side: Sequence[float]) -> float | None:
-    """Mean over both sides, None where one of them was not recorded."""
+    """Return the mean over both sides, None if one of them was not recorded."""
     return mean_of(by_side) if len(by_side) == len(SIDES) else None
 
 
@@ -306,7 +306,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     recordings, model = read_board(arguments.folder), read_model(arguments.model)
     found: dict[str, Any] = {}
     for align, title in ((True, "channels aligned"), (False, "as recorded")):

@@ -1,15 +1,15 @@
-"""`worldstate-lab junctions`: how far classifiers and thresholds carry to a junction that was left out.
+"""`worldstate-lab junctions`: transfer of classifiers and thresholds to a junction that is left out.
 
-FOLDER holds real recordings of a corner in the layout of `worldstate-lab sequences`. The chain runs on the
+FOLDER has real recordings of a corner in the layout of `worldstate-lab sequences`. The chain runs on the
 spectra of seven microphones, with the camera. All thresholds are set on the other junctions. The published
-classifier and the ensemble that this library ships are trained on the released windows in --features, without
-those of all recordings in --lists: first on every junction, then without any window of the tested junction.
-The ensemble is trained on these real windows alone, because its simulated ones take hours. Sequence and
-filter are not part of it: the sequence learned no real junction. "shipped scores" are those of the model as
-it ships, which learned windows of every junction.
+classifier and the shipped ensemble are trained on the released windows in --features, without the recordings
+in --lists: first on every junction, then without the tested junction. The ensemble is trained on these real
+windows alone, because its simulated ones take hours. Sequence and filter are not part of it, because the
+sequence learned no real junction. "shipped scores" are those of the shipped model, which learned windows of
+every junction.
 
-Each row has the approaches with a warning, the lead, alarms an hour, the hazard AUROC one and two seconds
-before T0, and the worst junction of each; --json has all of them by junction.
+Each row has the announced approaches, the lead, alarms per hour, the hazard AUROC one and two seconds before
+T0, and the worst junction of each; --json has all of them by junction.
 
 Examples
 --------
@@ -72,7 +72,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     recordings = read_recordings(arguments.folder)
     if len(junctions_with_both([(one.junction, one.hazard_free) for one in recordings])) < 2:
         raise InvalidArgumentError("recordings: expected approaches and hazard-free ones at two junctions")
@@ -108,7 +108,7 @@ def across(
 
 
 def _row(trials: Sequence[Trial], said: Sequence[Decisions], rng: np.random.Generator) -> dict[str, Any]:
-    """Return the figures of the answers of one method, by junction, too."""
+    """Return the figures of one method, by junction, too."""
     areas = leads(trials, [one.score for one in said], None, rng)
     found = alarm_row(trials, [[one.alarm for one in said]], rng)
     by_site = {site: alarm_row(*part, rng) for site, part in _by_site(trials, said)}

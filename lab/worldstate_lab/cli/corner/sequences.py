@@ -1,16 +1,17 @@
-"""`worldstate-lab sequences`: what the product is worth on real recordings of a corner.
+"""`worldstate-lab sequences`: performance of the product on real recordings of a corner.
 
-FOLDER holds `truth.csv`, `srp.npz`, `sound/`, `boxes/` and, for the second path, `pair/`. Every recording
-runs through the product's own chain, with the camera and by sound alone: on the path *seven* from the spectra
-of seven microphones and one channel of sound, with the model that ships; on the path *pair* from two
-channels, with a model made for them, whose simulated exam stands beside the figures. A row of the spectra is
-of the second that begins with it: as they lie, a hop of *seven* uses sound up to 0.9 s after it. The path
+FOLDER has `truth.csv`, `srp.npz`, `sound/`, `boxes/` and, for the second path, `pair/`. Every recording runs
+through the product's own chain, with the camera and by sound alone: on the path *seven* from the spectra of
+seven microphones and one channel of sound, with the shipped model; on the path *pair* from two channels, with
+a model made for them, whose simulated exam is printed with the figures. A row of the spectra covers the
+second that begins with it: without correction, a hop of *seven* uses sound up to 0.9 s after it. The path
 *seven_on_time* computes half seconds from the rows and uses each when it has ended.
 
-Printed for each path: the hazard AUROC so long before T0, what the alarm warns of and costs beside the rows
-of Table I (thresholds from five folds over recordings), the best thresholds at so many false onsets (a curve:
-they are chosen afterwards), calibration, and the same for parts of the product. Boxes count from a score of
-0.3 and a height of 60 pixels on; those of vehicles that stand through a recording do not.
+The output has for each path: the hazard AUROC at times before T0; the announced approaches and the cost of
+the alarm beside the rows of Table I (thresholds from five folds over recordings); the best thresholds at
+given numbers of false onsets (chosen afterwards); calibration; and the same for parts of the product. Boxes
+have a score of at least 0.3 and a height of at least 60 pixels; vehicles parked throughout a recording are
+excluded.
 
 The published classifier is trained on --features without the windows of all recordings in --lists.
 
@@ -56,7 +57,7 @@ from worldstate_lab.sequences.window_rows import window_lines, window_rows
 from worldstate_lab.trials.pass_cache import Failed, attempted
 
 EXAM = "exam.json"
-_LONGEST_CUT_S = 2.0  # T0 is 7 s in most recordings, 2 s in one: what is left must hold a hop before it
+_LONGEST_CUT_S = 2.0  # T0 is 7 s in most recordings and 2 s in one: the rest must contain a hop before it
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +78,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     _check(arguments)
     arguments.seeds = range(arguments.seed, arguments.seed + (1 if arguments.windows else SEEDS))
     start_s = round(in_range("--start", arguments.start, 0.0, _LONGEST_CUT_S), 1)
@@ -143,7 +144,7 @@ def _figures(arguments: argparse.Namespace, chain: Chain, heard: Heard) -> dict[
     exam = arguments.exam or arguments.folder / PAIR / EXAM
     if chain.path == "pair" and exam.exists():
         found["exam"] = exam_figures(exam)
-    # What other modules measure of the same recordings is merged here.
+    # Measurements of other modules on the same recordings are merged here.
     rng = np.random.default_rng(arguments.seed)
     followed = [one for one in heard.followed if one is not None]
     found |= tracking_figures(followed, rng) if followed else dict.fromkeys(FOLLOWED)
@@ -151,7 +152,7 @@ def _figures(arguments: argparse.Namespace, chain: Chain, heard: Heard) -> dict[
 
 
 def _sums(arguments: argparse.Namespace, heard: Mapping[PathName, Heard], seven: Chain) -> dict[str, Any]:
-    """Return by path what the sums of parts are worth on recordings that all paths heard."""
+    """Return by path the performance of sums of parts on recordings of all paths."""
     levels = LevelReading.learned([HeardStream.load(one) for one in arguments.streams], seven.model)
     found = dict[str, Any]()
     for path in SPECTRA:

@@ -1,14 +1,13 @@
-"""`worldstate-lab staged`: what a camera alone finds on real videos of a corner, clean and staged.
+"""`worldstate-lab staged`: detections of a camera alone on real videos of a corner, clean and degraded.
 
-Blur, darkness, noise and a soiled lens (rain on it: blur and darkness at once, no drops) are staged at four
-levels on the videos of a folder, and a detector searches them: NanoDet on three crops of every second image,
-or the project's motion detector on every image. Boxes are kept in DIR/DETECTOR-FAMILY-LEVEL/ID.json and
-are not searched again.
+Blur, darkness, noise and a wet lens (blur and darkness together, without drops) are staged at four levels on
+the videos of a folder, and a detector runs on them: NanoDet on three crops of every second image, or the
+project's motion detector on every image. Boxes are kept in DIR/DETECTOR-FAMILY-LEVEL/ID.json and reused.
 
-Printed are which least score and height of NanoDet were tried on the clean boxes, with each junction left
+The output has the scores and heights of NanoDet that were tried on the clean boxes, with each junction left
 out; the miss rate beta of the reference vehicle after T0 by state and angle; and the share of images after T0
-in which a moving vehicle is found, beside that of hazard-free images. `--timeline ID` draws one approach, of
-which no image may leave the machine: into DIR as well.
+with a detected moving vehicle, beside that of hazard-free images. `--timeline ID` draws one approach into
+DIR; its images must not be published.
 
 Examples
 --------
@@ -75,7 +74,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     recordings = read_recordings(arguments.folder)
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.timeline is not None:
@@ -102,12 +101,12 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _stage(staging: Staging, recordings: Sequence[CornerRecording], jobs: int) -> None:
-    """Search what is missing, approaches first: they have more to show if the work is stopped."""
+    """Process missing states, approaches first, because they are more useful if the work is stopped."""
     missing = sorted((one for one in recordings if staging.missing(one)), key=lambda one: one.hazard_free)
     if missing:
         states = sum(len(staging.missing(one)) for one in missing)
         ms = milliseconds_a_search(staging, missing[0])
-        # Ten images a second, and what is staged costs a fifth on top.
+        # Ten images per second; staging adds a fifth.
         minutes = 1.2e-3 * ms * states * 10.0 * missing[0].length_s / staging.every / jobs / 60.0
         told = f"staging, {ms:.0f} ms a search, {minutes:.0f} minutes"
         list(track(in_processes(partial(stage_recording, staging), missing, jobs), told, len(missing)))
@@ -134,7 +133,7 @@ def _choice_row(one: BoxChoice) -> tuple[float, ...]:
 
 
 def _beta_report(curves: BetaCurves) -> dict[str, Any]:
-    """Return beta by family, angle and level, and how often it falls where it ought to rise."""
+    """Return beta by family, angle and level, and how often it falls with the level."""
     levels = range(curves.looks.shape[2])
     falls = {
         along: {
@@ -199,7 +198,7 @@ def _timeline(arguments: argparse.Namespace, recordings: Sequence[CornerRecordin
 
 
 def _decided(trial: Trial, steps: Iterable[Step]) -> Decisions:
-    """Return what the alarm compared at every hop with its threshold, both as probabilities."""
+    """Return the statistic of the alarm and its threshold at every hop, both as probabilities."""
     evidence = [
         max((cue.evidence for cue in one.state.cues if cue.evidence), key=lambda terms: terms.compared_nats)
         for one in steps
