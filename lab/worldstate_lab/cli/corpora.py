@@ -3,8 +3,8 @@
 Reproduce the signature study of "Evidence of Absence", section IX: 16 log-energies per clip, a logistic
 regression, and the area under the ROC curve of vehicle against background with an interval over recordings.
 
-by level   the energies themselves, which change with gain and distance by shape   the energies without their
-mean, which do not
+  by level   the energies themselves, which change with gain and distance
+  by shape   the energies without their mean, which do not
 
 Every row is measured on recordings outside the training: the official split if the corpus has one, else folds
 by recording; or training on one corpus and scoring on the other. Electric cars, bicycles and trams are

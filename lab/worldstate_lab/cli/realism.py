@@ -5,12 +5,12 @@ seeds, and compare them with the table. Each figure is followed by the same figu
 between groupings of the junctions, and of every junction against the others of its type. A figure outside
 that range is marked with "!", and one outside the target range with "x".
 
-C2ST       separation of two sets by boosting; 0.5 is indistinguishable AUROC of   the same for one measure,
-by class: level, peak, width, prominence, change, position transfer   the published classifier trained on one
-and tested on the other, beside the loudest direction medians    of level and shape; within 15 %; and spreads,
-and the share of variance between sites side       share of hidden windows with the right side, by a
-classifier of other junctions positions  loss of classifiers if the features assume permuted microphone
-positions
+  C2ST       separation of two sets by boosting; 0.5 is indistinguishable
+  AUROC of   the same for one measure, by class: level, peak, width, prominence, change, position
+  transfer   the published classifier trained on one and tested on the other, beside the loudest direction
+  medians    of level and shape; within 15 %; and spreads, and the share of variance between sites
+  side       share of hidden windows with the right side, by a classifier of other junctions
+  positions  loss of classifiers if the features assume permuted microphone positions
 
 FEATURES.csv is a table of labelled windows, such as the one released with OVAD or one of `worldstate model
 features`. OUT/realism.json is the report, OUT/windows-SEED.csv the simulated windows, OUT/permuted-SEED.csv
