@@ -1,7 +1,7 @@
 """Explanations of evidence: hidden source, visible source, no source.
 
-This folder turns evidence into a posterior and knows no audio: it serves any modality that has a signature
-model and an expected co-evidence.
+This package combines priors, evidence and co-evidence into a posterior. It does not process audio, so any
+modality with a signature model and an expected co-evidence can use it.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
-"""Sectors that a co-evidence channel is asked about, its answers and its miss rate.
+"""Searched sectors, results of a co-evidence channel and its miss rate.
 
-Answers are present, absent or unqueried. Absence is a measurement and has a type of its own. A sensor that
-was not asked gives neither presence nor absence: `Unqueried`, beta = 1. The miss rate beta_c(theta, d), over
-azimuth and degradation, never falls.
+A result is present, absent or unqueried. Absence is a measurement and has its own type. A sensor that did
+not search the sector gives neither presence nor absence: `Unqueried`, beta = 1. The miss rate
+beta_c(theta, d) never falls with azimuth or degradation.
 """
 
 import math
@@ -25,7 +25,7 @@ class Sector:
     Parameters
     ----------
     centre_rad, half_width_rad : float
-        In `base_link`, left positive.
+        Centre in `base_link`, left positive, and half the width.
 
     Examples
     --------
@@ -37,11 +37,11 @@ class Sector:
     half_width_rad: float
 
     def touches(self, azimuth_rad: float, width_rad: float = 0.0) -> bool:
-        """Tell whether an object of this width, centred there, reaches into the sector."""
+        """Return whether an object of this width, centred at the azimuth, reaches into the sector."""
         return abs(wrap_angle(azimuth_rad - self.centre_rad)) <= self.half_width_rad + width_rad / 2
 
     def overlap(self, other: "Sector") -> "Sector | None":
-        """Return the intersection with another sector, None where empty; less than a full turn together."""
+        """Return the intersection with another sector or None; both together span less than a full turn."""
         offset = wrap_angle(self.centre_rad - other.centre_rad)
         low = max(offset - self.half_width_rad, -other.half_width_rad)
         high = min(offset + self.half_width_rad, other.half_width_rad)
@@ -55,7 +55,7 @@ class Sector:
 
     @classmethod
     def between(cls, right_rad: float, left_rad: float) -> "Sector":
-        """Return the sector that runs from `right_rad` to the left until `left_rad`, a full turn or less."""
+        """Return the sector from `right_rad` leftwards to `left_rad`, at most a full turn."""
         if left_rad - right_rad >= 2.0 * math.pi:
             return cls(0.0, math.pi)
         half = (left_rad - right_rad) % (2.0 * math.pi) / 2.0
@@ -63,7 +63,7 @@ class Sector:
 
     @classmethod
     def in_sight(cls, right_rad: Iterable[float], left_rad: Iterable[float]) -> "Sector":
-        """Return the directions ahead that occluders with these edges leave free.
+        """Return the free sector ahead between the edges of occluders.
 
         Examples
         --------
@@ -83,7 +83,7 @@ class Absent:
     miss_rate : float
         beta_c(theta, d): probability that a visible source of this class is missed, in [0, 1].
     clutter_rate : float
-        Probability that the channel reports co-evidence where there is none, in [0, 1).
+        Probability that the channel reports co-evidence without a source, in [0, 1).
 
     Examples
     --------
@@ -111,7 +111,7 @@ class Absent:
 
         References
         ----------
-        "Evidence of Absence", eq. (6). An empty sector needs that nothing is found by mistake.
+        "Evidence of Absence", eq. (6). An empty sector also requires that there is no false detection.
         """
         spurious = np.log1p(-self.clutter_rate)
         with np.errstate(divide="ignore"):
@@ -128,8 +128,8 @@ class Present:
     miss_rate : float
         beta_c(theta, d) of the channel, in [0, 1].
     clutter_rate : float
-        Probability of co-evidence where there is no such source, in (0, 1): with zero a single false
-        detection would remove the hidden explanation for ever.
+        Probability of co-evidence without such a source, in (0, 1). At zero, a single false detection would
+        remove the hidden explanation permanently.
 
     Examples
     --------
@@ -157,7 +157,7 @@ class Present:
 
         References
         ----------
-        Derived here: the complement of `Absent`.
+        Derived here as the complement of `Absent`.
         """
         spurious = np.log(self.clutter_rate)
         found = np.log1p(-self.miss_rate * (1.0 - self.clutter_rate))
@@ -166,12 +166,12 @@ class Present:
 
 @dataclass(frozen=True, slots=True)
 class Unqueried:
-    """The channel was not asked: no frame, outside its field of view, or no such sensor.
+    """The channel did not search the sector: no image, outside its field of view, or no such sensor.
 
     Parameters
     ----------
     reason : str
-        For people and logs.
+        Explanation for people and logs.
 
     Examples
     --------
@@ -185,7 +185,7 @@ class Unqueried:
         check_fields(self, reason=str)
 
     def log_likelihoods(self) -> np.ndarray:
-        """Zero for every explanation, shape (3,): beta = 1, it moves nothing.
+        """Zero for every explanation, shape (3,): with beta = 1 the posterior does not change.
 
         ``log p = 0`` for all.
 
@@ -206,7 +206,7 @@ CoEvidence = Absent | Present | Unqueried
 
 Rows = tuple[tuple[float, ...], ...]
 
-# A look that misses more watches nothing: one in view would be counted as none.
+# A channel with a higher miss rate does not observe its sector: a visible vehicle would be taken for none.
 MOSTLY_MISSED = 0.5
 
 
@@ -216,9 +216,9 @@ class MissRateTable:
 
     .. math:: \beta_c(\theta, d) = p(V = absent \mid h_{vis}, \theta, d),
 
-    bilinear between the points of the table, the same on both sides. It is 1 beyond the last azimuth, where
-    the channel does not see, and beyond the last degradation, where none was measured. It never falls with
-    the azimuth or the degradation: a table that says so was measured on too little.
+    bilinear between the points of the table and equal on both sides. It is 1 beyond the last azimuth, which
+    is outside the view, and beyond the last degradation, which was not measured. A table that falls with
+    azimuth or degradation is rejected, because it was fitted on too few data.
 
     Parameters
     ----------
@@ -227,14 +227,14 @@ class MissRateTable:
     degradation : tuple of float
         Degradation levels d, increasing from 0 (clean) to at most 1 (blind).
     beta : tuple of tuple of float
-        Miss rates in [0, 1], one row an azimuth, one column a degradation.
+        Miss rates in [0, 1], one row per azimuth and one column per degradation.
     per_class : mapping of str to tuple of tuple of float
-        Rows of their own for some classes; all others use `beta`.
+        Separate rows for some classes; all others use `beta`.
 
     Raises
     ------
     InvalidArgumentError
-        If the axes do not increase or do not fit, or a rate falls or leaves [0, 1].
+        If the axes do not increase or do not fit, or a rate falls or is outside [0, 1].
 
     Examples
     --------
@@ -269,7 +269,7 @@ class MissRateTable:
         self, azimuths_rad: FloatArray, degradation: float = 0.0, label: str | None = None
     ) -> FloatArray:
         """Return beta at several azimuths, shape (n,), and one degradation."""
-        # Asked many times a hop: a comparison, which NaN fails too.
+        # Called many times per hop: one comparison, which NaN fails too.
         if not 0.0 <= degradation <= 1.0:
             raise InvalidArgumentError(f"degradation: expected a number in [0, 1], got {degradation}")
         magnitude_deg = np.abs(np.degrees(azimuths_rad))
@@ -281,7 +281,7 @@ class MissRateTable:
 
 
 def default_miss_rates() -> MissRateTable:
-    r"""Return the table used where none was measured.
+    r"""Return the table that is used if none was measured.
 
     .. math:: \beta(\theta, d) = (1 - d)\, \min(0.04 + 0.004\, |\theta_{deg}|,\; 0.97) + 0.97\, d
 
@@ -291,8 +291,8 @@ def default_miss_rates() -> MissRateTable:
     >>> round(table(0.0), 2), round(table(np.radians(-25.0)), 2), round(table(0.0, 1.0), 2), table(1.6)
     (0.04, 0.14, 0.97, 1.0)
     """
-    # What the paper measured on clean frames: .04 at boresight, .14 at 25 deg, and on at that slope over the
-    # half plane, for a view ends by the camera's own angle; .97 under the harshest noise, linear in between.
+    # Measured in the paper on clean frames: 0.04 at boresight and 0.14 at 25 deg. The slope continues over
+    # the half plane, because the camera's own angle ends the view. Under the strongest noise it is 0.97.
     boresight, abeam_deg = 0.04, math.degrees(0.5 * math.pi)
     clean = boresight, boresight + boresight / 10.0 * abeam_deg
     return MissRateTable((0.0, abeam_deg), (0.0, 1.0), tuple((rate, 0.97) for rate in clean))
@@ -304,7 +304,7 @@ def _check_axis(name: str, values: tuple[float, ...], limit: float) -> None:
         raise InvalidArgumentError(f"{name}: expected numbers that increase from 0 to at most {limit}")
 
 
-# Far below the resolution of any miss rate that is counted.
+# Enough to converge far below the resolution of a measured miss rate.
 _SWEEPS = 2000
 
 
@@ -320,7 +320,7 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
     ----------
     Dykstra and Robertson, "An algorithm for isotonic regression for two or more independent variables", 1982.
     """
-    # by Dykstra's projections onto the two sets in turn, each a pooling of adjacent violators.
+    # Dykstra's alternating projections onto the two sets; each projection pools adjacent violators.
     grid = finite_array("values", values, (None, None)).copy()
     weight = finite_array("weights", weights, grid.shape)
     if not grid.size or (weight <= 0).any():
@@ -334,13 +334,13 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
         along_columns += by_row - grid
         if max(np.abs(grid - before).max(), np.abs(grid - by_row).max()) < TINY:
             break
-    # What is left of the alternation, far below any rate that could be measured, must not break the order.
+    # The remaining error of the iteration is negligible, but it must not break the order.
     return np.maximum.accumulate(np.maximum.accumulate(grid, axis=0), axis=1)
 
 
 def _pooled_rows(values: FloatArray, weights: FloatArray) -> FloatArray:
     """Pool adjacent violators of every row."""
-    # Imported where it is used: it takes 0.4 s, which a command that only prints its options would pay.
+    # Imported here because it takes 0.4 s, which a command that only prints its options would pay.
     from scipy.optimize import isotonic_regression
 
     pairs = zip(values, weights, strict=True)

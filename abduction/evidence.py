@@ -1,7 +1,7 @@
-"""Log-likelihoods of one observation under every explanation, and what they make of the priors.
+"""Log-likelihoods of one observation under every explanation, and the posterior that follows from them.
 
-Explanations stand in the order of `SignatureEvidence`: hidden in each of K directions, visible, none. All is
-done in nats, and a prior of zero is a log of -inf.
+The explanations have the order of `SignatureEvidence`: hidden in each of K directions, visible, none. All
+values are in nats; the log of a zero prior is -inf.
 """
 
 import math
@@ -18,29 +18,29 @@ from worldstate.ground.checks import all_of, check_fields, check_shape, finite_a
 
 from .co_evidence import CoEvidence
 
-# A window of a second differs by tens of nats between explanations; beyond this, sums lose the digits that
-# probabilities consist of.
+# A window of 1 s differs by tens of nats between explanations. Beyond this limit, sums lose the digits from
+# which probabilities are computed.
 MOST_NATS = 1000.0
 _NATS = (-MOST_NATS, MOST_NATS)
 
 
 @dataclass(frozen=True, slots=True)
 class SideEvidence:
-    r"""What one window says of each side by itself: a vehicle on one leaves the other open.
+    r"""Evidence of one window for each side separately: a vehicle on one side does not exclude the other.
 
     Parameters
     ----------
     directions : tuple of str
         Labels of the sides.
     log_ratios : tuple of float
-        By side, log-likelihood of a vehicle hidden there above that of one in view or none, nats; 0 and less
-        where nothing speaks for it.
+        Per side, log-likelihood of a vehicle hidden there minus that of "visible or none", nats; 0 or less
+        without evidence of a vehicle.
     both : float
         Posterior of hidden vehicles on both sides at the training prior.
     direct : float
-        Posterior of a source in the open, whose bearing says where it is: no side is named then.
+        Posterior of a source in the open. Its bearing gives its position, so it has no side.
     visible : float
-        Log-likelihood of one in view above that of none, with a source in the open left aside, nats.
+        Log-likelihood of a visible vehicle minus that of none, without sources in the open, nats.
 
     Raises
     ------
@@ -72,7 +72,7 @@ class SignatureEvidence:
 
     .. math:: \ell_{hid}(y) = \sum_k P(k \mid hid)\, \ell_{hid,k}(y)
 
-    is the integral over the hidden state of eq. (6), with the direction weights carried by the filter.
+    is the integral over the hidden state in eq. (6); the filter provides the direction weights.
 
     Parameters
     ----------
@@ -85,12 +85,12 @@ class SignatureEvidence:
     none : float
         log l_0, nats.
     sides : SideEvidence, optional
-        Each side by itself, where the model tells.
+        Evidence for each side separately, if the model provides it.
 
     Raises
     ------
     InvalidArgumentError
-        If a log-likelihood is not finite or beyond 1,000 nats, or the numbers do not fit the directions.
+        If a log-likelihood is not finite or beyond 1,000 nats, or their number differs from the directions'.
 
     Examples
     --------
@@ -120,7 +120,7 @@ class SignatureEvidence:
 
     @property
     def likelier_side(self) -> Literal["left", "right"] | None:
-        """The side with the higher likelihood, None if they are equal or no sides."""
+        """The side with the higher likelihood; None if they are equal or the directions are not sides."""
         by_direction = dict(zip(self.directions, self.hidden, strict=True))
         left, right = by_direction.get("left"), by_direction.get("right")
         if left is None or right is None or left == right:
@@ -129,28 +129,28 @@ class SignatureEvidence:
 
 
 def _nats(name: str, values: object, size: int) -> tuple[float, ...]:
-    """Return log-likelihoods as floats; refuse what is none or too large, or another number of them."""
+    """Return log-likelihoods as floats; raise an error on a wrong number of them or a value out of range."""
     if (type(values) is not tuple and not isinstance(values, Sequence | np.ndarray)) or len(values) != size:
-        raise InvalidArgumentError(f"{name}: expected one of each direction, got {values!r:.80}")
-    # Whole numbers among them would make arrays that no likelihood can be added to.
+        raise InvalidArgumentError(f"{name}: expected one value per direction, got {values!r:.80}")
+    # Integers would create integer arrays, to which no likelihood can be added in place.
     return tuple([in_range(name, one, *_NATS) for one in values])
 
 
-_IMAGE = 0.02  # Chance that the peak is an image after all
+_IMAGE = 0.02  # Probability that the peak of a direct sound is nevertheless a reflection
 
 
 def with_bearing_vote(
     evidence: SignatureEvidence, azimuth_rad: float, std_rad: float, direct: float
 ) -> SignatureEvidence:
-    r"""Return the evidence after a bearing of sound that is direct with a probability d; other sides stay.
+    r"""Return the evidence combined with a bearing whose sound is direct with probability d.
 
     .. math:: L'_{hid} = \min\big(L_{hid},\; (1 - d) L_{hid} + d\, \overline{L}\big), \qquad
               P'(k \mid hid) = (1 - d)\, P(k \mid hid) + d\, P(k \mid \theta), \quad
               P(left \mid \theta) = \tfrac{\epsilon}{2} + (1 - \epsilon)\, \Phi(\theta / \sigma)
 
-    with the mean of the likelihoods of visible and none: the hidden explanation gains nothing on the others,
-    and its side is that of the bearing :math:`\theta \pm \sigma`. Reflected sound has no vote: its peak may
-    be an image in a wall.
+    where L-bar is the mean likelihood of visible and none. The hidden explanation gains nothing on the
+    others, and its side becomes that of the bearing :math:`\theta \pm \sigma`. A reflected sound has no
+    effect, because its peak may be an image in a wall. `SignatureEvidence.sides` is unchanged.
 
     Examples
     --------
@@ -159,13 +159,13 @@ def with_bearing_vote(
     >>> [round(value, 1) for value in voted.hidden], with_bearing_vote(wrong, 0.7, 0.1, 0.0) == wrong
     ([0.7, -3.9], True)
     """
-    # A sound that is less often direct than the peak is an image of the other side has no vote.
+    # If the sound is direct less often than a peak is a reflection on the other side, the bearing is unused.
     if direct < 0.5 * _IMAGE or set(evidence.directions) != {"left", "right"}:
         return evidence
     hidden = np.array(evidence.hidden)
     total = float(np.logaddexp(*hidden))
     neutral = float(np.logaddexp(evidence.visible, evidence.none))
-    # Log of the sum over two sides, and of the two others: the means differ by the same log 2.
+    # Sums over two explanations replace the means: both differ from them by log 2.
     kept = np.log1p(-direct) if direct < 1.0 else -np.inf
     level = min(total, float(np.logaddexp(kept + total, np.log(direct) + neutral)))
     left = 0.5 * _IMAGE + (1.0 - _IMAGE) * 0.5 * math.erfc(-azimuth_rad / (math.sqrt(2.0) * std_rad))
@@ -176,7 +176,7 @@ def with_bearing_vote(
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Probabilities of the explanations after one look.
+    """Probabilities of the explanations after one observation.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class Posterior:
     log_lambda : float
         Log of the mixture likelihood ratio Lambda, nats; see `log_lambda`.
     log_evidence : float
-        log Z: what the priors expected of this observation, nats.
+        log Z: log of the probability of this observation under the prior, nats.
 
     Examples
     --------
@@ -228,32 +228,32 @@ class Posterior:
 
 
 def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence) -> Posterior:
-    r"""Weigh the explanations of one observation.
+    r"""Return the posterior of the explanations of one observation.
 
     .. math::
         p(h \mid y, V) = \pi_h\, \ell_h(y)\, p(V \mid h) \,/\, Z,
 
-    eq. (6) with V absent: :math:`p(V \mid h)` is :math:`\beta_c(\theta, d)` for the visible explanation
-    and 1 for the others.
+    which is eq. (6) if V is absent: :math:`p(V \mid h)` is :math:`\beta_c(\theta, d)` for the visible
+    explanation and 1 for the others.
 
     Parameters
     ----------
     log_prior : array_like, shape (K + 2,)
-        Log prior of (hidden_1 .. hidden_K, visible, none), nats; normalised or not, -inf for a prior of zero.
+        Log prior of (hidden_1 .. hidden_K, visible, none), nats; need not be normalised; -inf for zero.
     evidence : SignatureEvidence
         Log-likelihoods of the observation.
     co_evidence : CoEvidence
-        What the channel that was asked answered.
+        Result of the co-evidence channel.
 
     Returns
     -------
     Posterior
-        Over hidden_1 .. hidden_K, visible, none.
+        Probabilities of hidden_1 .. hidden_K, visible, none.
 
     Raises
     ------
     InvalidArgumentError
-        On a prior of another shape, with NaN, +inf or no mass, or if no explanation remains possible.
+        If the prior has another shape, NaN, +inf or no mass, or if no explanation remains possible.
 
     References
     ----------
@@ -271,7 +271,7 @@ def abduce(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvi
 
 
 def posterior_of(prior: Sequence[float], evidence: SignatureEvidence, co_evidence: CoEvidence) -> Posterior:
-    """Return what `abduce` does for the log prior of a belief, shape (K + 2,), which is not checked."""
+    """Return the posterior as `abduce` does, without checks of the log prior, shape (K + 2,)."""
     log_likelihood = _log_likelihood(evidence, co_evidence)
     joint = tuple(map(add, prior, log_likelihood))
     log_evidence = _log_sum(joint)
@@ -288,11 +288,11 @@ def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: C
         \Lambda(y) = \frac{\ell_{hid}(y)}{w_{vis}\, \beta_c(\theta, d)\, \ell_{vis}(y) + w_0\, \ell_0(y)},
         \qquad w = \pi / (1 - \pi_{hid}),
 
-    with :math:`\ell_{hid} = \sum_k P(k \mid hid)\, \ell_{hid,k}`. It does not depend on how probable a hidden
-    source is beforehand; where that prior is zero, all directions weigh alike. +inf where neither other
-    explanation is possible.
+    with :math:`\ell_{hid} = \sum_k P(k \mid hid)\, \ell_{hid,k}`. It does not depend on the prior of a hidden
+    source; if that prior is zero, all directions have equal weights. It is +inf if neither other explanation
+    is possible.
 
-    Errors are those of `abduce`.
+    It raises the errors of `abduce`.
 
     Parameters
     ----------
@@ -301,12 +301,12 @@ def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: C
     evidence : SignatureEvidence
         Log-likelihoods of the signature.
     co_evidence : Absent, Present or Unqueried
-        Answer of the co-evidence channel.
+        Result of the co-evidence channel.
 
     Returns
     -------
     float
-        Nats.
+        Log ratio, nats.
 
     References
     ----------
@@ -328,37 +328,37 @@ def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: C
 def statistic(
     evidence: SignatureEvidence, co_evidence: CoEvidence, reference_prior: Sequence[float]
 ) -> float:
-    r"""Return eq. (6) at a fixed prior: the score in [0, 1] that a threshold was set for.
+    r"""Return the hidden posterior, eq. (6), at a fixed prior: the score that the threshold applies to.
 
-    With a classifier's likelihood ratios and its own training prior this is
+    With a classifier's likelihood ratios and its training prior this is
 
     .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}},
 
-    the published :math:`P_l + P_r` at beta = 1 and ours, with the visible explanation removed, at beta = 0.
-    It is a monotone map of Lambda, whatever context and time say of the priors.
+    At beta = 1 this is the published :math:`P_l + P_r`. At beta = 0 the visible explanation is removed. The
+    statistic is a monotone function of Lambda and does not depend on context or time.
 
     Parameters
     ----------
     evidence : SignatureEvidence
         Log-likelihoods of the observation.
     co_evidence : CoEvidence
-        What the channel that was asked answered.
+        Result of the co-evidence channel.
     reference_prior : sequence of float, shape (K + 2,)
         Probabilities, not logs, of (hidden_1 .. hidden_K, visible, none).
 
     Returns
     -------
     float
-        In [0, 1].
+        Score in [0, 1].
 
     Raises
     ------
     InvalidArgumentError
-        As `abduce`.
+        Under the conditions of `abduce`, or if a prior is negative.
 
     References
     ----------
-    "Evidence of Absence", eq. (6) at a fixed prior.
+        "Evidence of Absence", eq. (6) at a fixed prior.
 
     Examples
     --------
@@ -380,11 +380,11 @@ def _checked_log_prior(log_prior: ArrayLike, directions: int) -> list[float]:
     prior = np.asarray(log_prior, dtype=np.float64)
     check_shape("log_prior", prior.shape, (directions + 2,))
     if not np.isfinite(prior.max()):
-        raise InvalidArgumentError(f"log_prior: expected logs with some mass, got {prior.tolist()}")
+        raise InvalidArgumentError(f"log_prior: expected finite logs with some mass, got {prior.tolist()}")
     return list(map(float, prior))
 
 
-# Of a handful of explanations: arrays of so few numbers take ten times as long.
+# Lists, because arrays of so few numbers take ten times as long.
 def _log_likelihood(evidence: SignatureEvidence, co_evidence: CoEvidence) -> list[float]:
     hidden, visible, none = co_evidence.log_likelihoods().tolist()
     return [*(one + hidden for one in evidence.hidden), evidence.visible + visible, evidence.none + none]
@@ -401,7 +401,7 @@ def _log_ratio(prior: Sequence[float], log_likelihood: Sequence[float]) -> float
 
 
 def _log_sum(values: Iterable[float]) -> float:
-    """log(sum(exp(values))) without overflow; a sum of nothing possible is -inf."""
+    """log(sum(exp(values))) without overflow; -inf if every value is -inf."""
     every = tuple(values)
     largest = max(every)
     if largest == -math.inf:

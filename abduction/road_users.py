@@ -1,16 +1,16 @@
-r"""Which kind of road user one microphone hears, or whether the sound is none that a model was made for.
+r"""Kinds of road users from the sound at one microphone, and a guard against unknown kinds of sound.
 
-Both are a softmax over classes of x, the numbers of one microphone over two seconds:
+Both are a softmax over classes. Its input x is the sound character of one microphone over two seconds:
 
 .. math:: p_c = \frac{e^{\ell_c}}{\sum_k e^{\ell_k}}, \qquad \ell_c = w_c^T x + b_c
 
-Of the kinds one is *unknown*: sound in which a vehicle, if there is one, lies below the ambience. The classes
-of the guard are the street, kinds of foreign sounds and warning signals of vehicles:
+One kind is *unknown*: any vehicle in such a sound is quieter than the ambience. The classes of the guard are
+the street, kinds of foreign sounds and warning signals of vehicles:
 
 .. math:: \lambda = \log \sum_{c \ne street} e^{\ell_c} - \ell_{street}
 
-Above a threshold on lambda, held on streets never heard, the sound is not the street's. It is a warning
-signal where the log-odds of signals over all that is foreign exceed a second threshold.
+If lambda exceeds a threshold, chosen on streets outside the training set, the sound is foreign to the street.
+It is a warning signal if the log-odds of signals over foreign sounds exceed a second threshold.
 """
 
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ from worldstate.ground.checks import all_of, freeze_arrays, in_range, named
 from worldstate.ground.serialisation import ADDED, Layout
 
 UNKNOWN, SIREN = "unknown", "siren"
-# As detectors of COCO's classes call them; a van is a car to some and a truck to others.
+# The COCO classes that detectors report for each kind; they report a van as a car or as a truck.
 SEEN_AS = {
     "car": {"car"},
     "van": {"car", "truck"},
@@ -35,16 +35,16 @@ SEEN_AS = {
     "bicycle": {"bicycle"},
     "tram": {"train"},
 }
-# Kinds that the camera is asked about together hold the one that is heard this often; a narrower question
-# would take a wrong guess of the ear for a look at the right thing.
+# Probability mass of the kinds that are looked up in the camera together. With fewer kinds, a wrong
+# classification of the sound would look for the wrong object.
 _ASKED = 0.95
 _ROUNDING = 1e-6
 ClassShares: TypeAlias = tuple[tuple[str, float], ...]
-"""Names of classes with their probabilities, sorted by name."""
+"""Classes with their probabilities, sorted by name."""
 
 
 def class_shares(name: str, value: object) -> ClassShares:
-    """Return classes with their probabilities, sorted; refuse what is none.
+    """Return classes with their probabilities, sorted; raise an error if the value is none.
 
     Examples
     --------
@@ -72,20 +72,20 @@ class RoadUserModel:
     Parameters
     ----------
     measures : tuple of str
-        Names of what it reads, in their order.
+        Names of the inputs, in order.
     classes : tuple of str
-        Kinds, *unknown* among them.
+        Kinds, including *unknown*.
     weights : ndarray, shape (classes, measures)
-        Of the softmax.
+        Weights of the softmax.
     biases : ndarray, shape (classes,)
-        Of the softmax; they hold the shares of the classes in use.
+        Biases of the softmax; they include the frequencies of the classes in use.
     shares : ndarray, shape (classes,), optional
-        Those shares.
+        Those frequencies.
 
     Raises
     ------
     InvalidArgumentError
-        If the coefficients do not fit one another or no class is *unknown*.
+        If the shapes of the coefficients differ or no class is *unknown*.
 
     Examples
     --------
@@ -108,14 +108,14 @@ class RoadUserModel:
             freeze_arrays(self, shares=(len(self.classes),))
 
     def with_shares(self, shares: FloatArray) -> "RoadUserModel":
-        r"""Return the model where classes are as frequent as given; as it is if its own shares are unknown.
+        r"""Return the model with other class frequencies; unchanged if the model has no frequencies.
 
         .. math:: p_c' \propto p_c\, \pi_c' / \pi_c
 
         Parameters
         ----------
         shares : ndarray, shape (classes,)
-            Of sum 1; a class of share 0 is never heard.
+            Frequencies with sum 1; a class with frequency 0 is never detected.
         """
         if self.shares is None:
             return self
@@ -130,7 +130,7 @@ class RoadUserModel:
         Parameters
         ----------
         measures : ndarray, shape (n, measures)
-            Rows.
+            One row of inputs per hop.
         """
         logits = measures @ self.weights.T + self.biases
         return np.asarray(np.exp(logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)))
@@ -141,13 +141,13 @@ class RoadUserModel:
         Parameters
         ----------
         measures : ndarray, shape (measures,)
-            `AcousticFrame.character`.
+            `AcousticFrame.character` of the hop.
         """
         return tuple(sorted(zip(self.classes, self.probabilities(measures[None])[0].tolist(), strict=True)))
 
 
 def with_siren(shares: ClassShares, log_odds: float) -> ClassShares:
-    r"""Return classes of a sound in which a siren is heard: of the softmax over kinds it is none.
+    r"""Return the classes together with a siren, which is not a class of the softmax.
 
     .. math:: p_{siren} = \frac{1}{1 + e^{-\lambda}}, \qquad p_c' = (1 - p_{siren})\, p_c
 
@@ -178,12 +178,12 @@ def likeliest(shares: Iterable[tuple[str, float]], mass: float) -> frozenset[str
 
 @dataclass(frozen=True, slots=True)
 class Familiar:
-    """A sound of the kind that the model was made for.
+    """A kind of sound that the model was trained on.
 
     Parameters
     ----------
     log_odds : float
-        Of anything else, over the guard's threshold, nats: not positive.
+        Log-odds of all other sounds minus the guard's threshold, nats: not positive.
 
     Examples
     --------
@@ -198,14 +198,14 @@ class Familiar:
 
 @dataclass(frozen=True, slots=True)
 class Foreign:
-    """A sound that the model was not made for.
+    """A kind of sound that the model was not trained on.
 
     Parameters
     ----------
     reason : str
-        What it is taken for.
+        Most similar kind of foreign sound.
     log_odds : float
-        Over the guard's threshold, nats: positive.
+        Log-odds of a foreign sound minus the guard's threshold, nats: positive.
 
     Examples
     --------
@@ -221,14 +221,14 @@ class Foreign:
 
 @dataclass(frozen=True, slots=True)
 class WarningSignal:
-    """A warning signal of a vehicle: evidence of it is left as it is.
+    """A warning signal of a vehicle; it does not change the evidence.
 
     Parameters
     ----------
     signal : str
         Siren, horn, reversing beeper or bicycle bell.
     log_odds : float
-        Over the guard's threshold, nats: positive.
+        Log-odds of a foreign sound minus the guard's threshold, nats: positive.
 
     Examples
     --------
@@ -246,7 +246,7 @@ DomainVerdict: TypeAlias = Familiar | Foreign | WarningSignal
 
 
 def heard_kinds(model: RoadUserModel, character: FloatArray, domain: DomainVerdict | None) -> ClassShares:
-    """Return the classes of one hop; none where the sound is foreign."""
+    """Return the classes of one hop; none if the sound is foreign."""
     if isinstance(domain, Foreign):
         return ()
     shares = model.classify(character)
@@ -256,7 +256,7 @@ def heard_kinds(model: RoadUserModel, character: FloatArray, domain: DomainVerdi
 
 
 def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
-    """Return the detector's classes that what is heard may be; None where it may be anything.
+    """Return the detector classes that match the likely kinds; None if the kind is unknown.
 
     Examples
     --------
@@ -273,29 +273,29 @@ def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DomainGuard:
-    """Coefficients of a guard, no rows of what it was trained on.
+    """Coefficients of a domain guard; it holds no training data.
 
     Parameters
     ----------
     measures : tuple of str
-        Names of what it reads, in their order.
+        Names of the inputs, in order.
     foreign, signals : tuple of str
-        Kinds of foreign sounds and of warning signals that it has heard.
+        Kinds of foreign sounds and of warning signals in its training data.
     weights : ndarray, shape (1 + foreign + signals, measures)
-        Of the softmax, the street first.
+        Weights of the softmax; the first row is the street.
     biases : ndarray, shape (1 + foreign + signals,)
-        Of the softmax.
+        Biases of the softmax.
     threshold : float
-        Log-odds that .025 of the hops of streets never heard exceed.
+        Log-odds that 2.5 % of the hops exceed on streets outside the training set.
     signal_nats : float
-        Log-odds of the signals over the foreign sounds from which a sound is a signal.
+        Log-odds of signals over foreign sounds above which a sound is a signal.
     margin : float
-        Nats that evidence of a foreign sound has to exceed to say anything.
+        Amount that is subtracted from the log ratios of a foreign sound, nats.
 
     Raises
     ------
     InvalidArgumentError
-        If the coefficients do not fit one another or a kind is missing.
+        If the shapes of the coefficients differ or a kind is missing.
 
     Examples
     --------
@@ -312,9 +312,9 @@ class DomainGuard:
     biases: FloatArray
     threshold: float
     signal_nats: float = field(default=0.0, metadata=ADDED)
-    # Foreign sounds alone alarm in .14 of their hops; less 2 nats in .06, less all in .04. Of vehicles that
-    # come while one is as loud as they are, .84, .63 and .42 are detected (43 sounds at five sites, kind and
-    # site never heard): lab/NOTES.md.
+    # Foreign sounds alone raise an alarm in 14 % of their hops; in 6 % with a margin of 2 nats, and in 4 %
+    # if all evidence is dropped. Of vehicles that approach during an equally loud foreign sound, 84, 63 and
+    # 42 % are detected (43 sounds, five sites, kind and site outside the training set): lab/NOTES.md.
     margin: float = 2.0
 
     def __post_init__(self) -> None:
@@ -324,25 +324,25 @@ class DomainGuard:
         freeze_arrays(self, weights=(classes, inputs), biases=(classes,))
 
     def log_odds(self, measures: FloatArray) -> FloatArray:
-        r"""Return the log-odds of anything but the street, over the threshold, shape (n,).
+        r"""Return the log-odds of all classes but the street minus the threshold, shape (n,).
 
         .. math:: \log \sum_{c \ne street} e^{w_c^T x + b_c} - (w_{street}^T x + b_{street}) - \tau
 
         Parameters
         ----------
         measures : ndarray, shape (n, measures)
-            Rows.
+            One row of inputs per hop.
         """
         logits = measures @ self.weights.T + self.biases
         return np.asarray(np.logaddexp.reduce(logits[:, 1:], axis=1) - logits[:, 0] - self.threshold)
 
     def judge(self, measures: FloatArray) -> DomainVerdict:
-        """Return what the measures of two seconds say.
+        """Classify the sound of two seconds as familiar, foreign or a warning signal.
 
         Parameters
         ----------
         measures : ndarray, shape (measures,)
-            `AcousticFrame.character`.
+            `AcousticFrame.character` of the hop.
         """
         log_odds = float(self.log_odds(measures[None])[0])
         if log_odds <= 0.0:
@@ -355,7 +355,7 @@ class DomainGuard:
 
 
 def neutral(evidence: SignatureEvidence, margin: float) -> SignatureEvidence:
-    r"""Return evidence that tells hidden from none only by what exceeds a margin, nats.
+    r"""Return the evidence with the log ratios of hidden to none reduced by a margin, nats.
 
     .. math:: \ell_k' = \ell_0 + \mathrm{sign}(r_k) \max(|r_k| - m, 0), \qquad r_k = \ell_k - \ell_0
 
@@ -373,5 +373,5 @@ def neutral(evidence: SignatureEvidence, margin: float) -> SignatureEvidence:
 
 
 def beyond(ratios: FloatArray, margin: float) -> FloatArray:
-    """Return the log ratios as far as they exceed a margin, nats, as `neutral` counts those of one hop."""
+    """Return log ratios reduced by a margin towards zero, nats, as in `neutral`."""
     return np.asarray(np.sign(ratios) * np.maximum(np.abs(ratios) - margin, 0.0))
