@@ -1,6 +1,6 @@
-"""From statistic to advisory: the sustained rule and the policy that carries its numbers.
+"""From the statistic to an advisory: the sustained rule and the policy with its parameters.
 
-The threshold of a policy is set in `thresholds`, its map to risk in `risk_map`.
+`thresholds` sets the threshold of a policy, and `risk_map` its map to risk.
 """
 
 from collections.abc import Sequence
@@ -16,24 +16,24 @@ from .risk_map import PlattMap, RiskMap
 
 @dataclass(frozen=True, slots=True)
 class CueingPolicy:
-    """Numbers of one false-alarm budget, fixed on calibration data and applied unchanged.
+    """Parameters of one false-alarm budget, fixed on calibration data and then applied unchanged.
 
     Parameters
     ----------
     gamma : float
-        Alarm when the statistic is at or above it.
+        An alarm requires a statistic of at least this value.
     sustain_hops : int
-        Consecutive hops that it has to hold.
+        Number of consecutive hops for which this has to hold.
     alpha : float
-        Share of hazard-free windows in alarm that gamma was set for.
+        Share of hazard-free windows in alarm for which gamma was set.
     reference_prior : tuple of float
-        Probabilities of (hidden_1 .. hidden_K, visible, none) at which the statistic is formed.
+        Probabilities of (hidden_1 .. hidden_K, visible, none) at which the statistic is computed.
     risk_map : RiskMap
-        From statistic to calibrated risk.
+        Map from the statistic to calibrated risk.
     miss_rate : float
-        The beta at which the statistic was formed on the calibration data: 0 with the visible explanation
-        removed, 1 for the published statistic. The statistic falls as beta rises, so a gamma set at 0 keeps
-        its budget at every beta.
+        The beta of the statistic on the calibration data: 0 without the visible explanation, 1 for the
+        published statistic. The statistic falls as beta rises, so a gamma set at 0 keeps its budget at every
+        beta.
 
     Raises
     ------
@@ -67,17 +67,17 @@ class CueingPolicy:
 
 @dataclass(frozen=True, slots=True)
 class CueingPolicies:
-    """The policies of one model: one for each budget and miss rate that it was calibrated at.
+    """The policies of one model: one per budget and miss rate of its calibration.
 
     Parameters
     ----------
     policies : tuple of CueingPolicy
-        At least one.
+        At least one policy.
 
     Raises
     ------
     InvalidArgumentError
-        If there is none.
+        If there is no policy.
 
     Examples
     --------
@@ -94,19 +94,19 @@ class CueingPolicies:
             raise InvalidArgumentError("policies: expected at least one")
 
     def for_alpha(self, alpha: float, miss_rate: float = 0.0) -> CueingPolicy:
-        """Return the policy of a budget, calibrated at the given miss rate (0 or 1 in a trained model).
+        """Return the policy of a budget at the given miss rate (0 or 1 in a trained model).
 
         Parameters
         ----------
         alpha : float
-            Budget.
+            Budget: share of hazard-free windows in alarm.
         miss_rate : float
-            beta of the co-evidence that the statistic was made with.
+            The beta of the statistic.
 
         Raises
         ------
         InvalidArgumentError
-            If the model was not calibrated for it; the message lists the budgets that it holds.
+            If the model was not calibrated for this budget; the message lists the available ones.
         """
         held: Sequence[CueingPolicy] = self.policies
         for name, wanted in (("alpha", alpha), ("miss_rate", miss_rate)):
@@ -119,7 +119,7 @@ class CueingPolicies:
 
 
 def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
-    r"""Return the smallest statistic of the last k hops; -inf where there are fewer.
+    r"""Return the smallest statistic of the last k hops; -inf if there are fewer.
 
     .. math:: h_t = \min(s_{t-k+1}, \dots, s_t)
 
@@ -130,7 +130,7 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
     >>> sustained_statistic([0.2, 0.9, 0.8, 0.1], sustain_hops=2)
     array([-inf,  0.2,  0.8,  0.1])
     """
-    # The sustained rule is in alarm exactly where this is at or above the threshold.
+    # The sustained rule raises an alarm exactly if this value is at or above the threshold.
     values = finite_array("statistic", statistic, (None,))
     hops = _check_sustain_hops(sustain_hops)
     held = np.full(values.shape, -np.inf)
@@ -140,7 +140,7 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
 
 
 def sustained_alarm(held: ArrayLike, sustain_hops: int) -> BoolArray:
-    """Return where the last k hops all held, shape (windows,): the sustained rule over a whole recording.
+    """Return whether each of the last k hops held, shape (windows,): the sustained rule for a recording.
 
     Shapes: held (windows,).
 
@@ -160,7 +160,7 @@ def _check_sustain_hops(sustain_hops: object) -> int:
 
 
 def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
-    """Return a policy for trying things out: no false-alarm budget was ever measured for it (alpha 0).
+    """Return a policy for experiments, for which no false-alarm budget was measured (alpha 0).
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
     Returns
     -------
     CueingPolicy
-        With alpha 0.
+        Policy with alpha 0.
 
     Examples
     --------
@@ -178,5 +178,5 @@ def uncalibrated_policy(directions: int = 2) -> CueingPolicy:
     0.9
     """
     prior = (1.0 / (directions + 2),) * (directions + 2)
-    # Three windows in a row above .9; slope -1 and offset 0 make the risk the statistic itself.
+    # Three windows in a row above 0.9; with slope -1 and offset 0 the risk is the statistic.
     return CueingPolicy(0.9, 3, 0.0, prior, PlattMap(-1.0, 0.0))

@@ -1,7 +1,7 @@
 """Calibrated risk: monotone maps from the statistic to the frequency of a hidden hazard, and their error.
 
-Windows overlap: how many independent ones a stream is worth decides which map is fitted. How well risk is
-calibrated, the reliability curve, the ECE with its sampling floor, Brier score and skill tell.
+Windows overlap, so the number of independent samples selects the map that is fitted. Calibration is measured
+by the reliability curve, the expected calibration error (ECE), the Brier score and its skill.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from worldstate.ground.serialisation import Layout
 from worldstate.ground.typing import IndexArray
 from worldstate.ground.values import RealT
 
-# Of the gradient, of values in units of the largest one.
+# Tolerance on the gradient; values are in units of the largest one.
 _GRADIENT_TOLERANCE = 1e-9
 
 
 def sigmoid(value: FloatArray, slope: ArrayLike, offset: ArrayLike) -> FloatArray:
-    r"""Return a falling or rising sigmoid without overflow, broadcast.
+    r"""Return a falling or rising sigmoid without overflow; the arguments are broadcast.
 
     .. math:: p(f) = 1 / (1 + \exp(A f + B))
 
@@ -35,7 +35,7 @@ def sigmoid(value: FloatArray, slope: ArrayLike, offset: ArrayLike) -> FloatArra
 
 
 def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
-    r"""Return (A, B) of greatest likelihood, with the targets drawn in by Platt's prior.
+    r"""Return the maximum-likelihood (A, B), with Platt's prior on the targets.
 
     .. math:: \hat A, \hat B = \arg\min_{A, B} -\sum_i \big[ t_i \ln p(f_i) + (1 - t_i) \ln(1 - p(f_i)) \big],
               \qquad t_+ = \frac{n_+ + 1}{n_+ + 2}, \quad t_- = \frac{1}{n_- + 2}
@@ -48,7 +48,7 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
         raise InvalidArgumentError("values: expected at least one decision value")
     n_positive, n_negative = int(label.sum()), int((~label).sum())
     target = np.where(label, (n_positive + 1) / (n_positive + 2), 1 / (n_negative + 2))
-    # In units of the largest value, so that the tolerance means the same at every scale.
+    # In units of the largest value, so that the tolerance does not depend on the scale.
     unit = float(np.abs(decision).max()) or 1.0
     design = np.stack([decision / unit, np.ones_like(decision)])
 
@@ -57,7 +57,7 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
         off = np.logaddexp(0.0, exponent) - (1.0 - target) * exponent
         return float(off.sum()), design @ (target - sigmoid(exponent, 1.0, 0.0))
 
-    # Imported where it is used: scipy.optimize takes longer than all else here.
+    # Imported here because scipy.optimize takes longer to import than everything else in this file.
     from scipy.optimize import minimize
 
     start, options = [0.0, np.log((n_negative + 1) / (n_positive + 1))], {"gtol": _GRADIENT_TOLERANCE}
@@ -65,18 +65,18 @@ def fit_sigmoid(values: ArrayLike, positive: ArrayLike) -> tuple[float, float]:
     return slope / unit, offset
 
 
-# Where isotonic regression stops losing to two numbers: see `fit_risk_map`.
+# Size from which isotonic regression is at least as good as Platt's map: see `fit_risk_map`.
 SMALL_SAMPLE = 200
 
 
 @dataclass(frozen=True, slots=True)
 class IsotonicMap:
-    """Linear between knots, constant beyond them."""
+    """A map that is linear between knots and constant beyond them."""
 
     LAYOUT: ClassVar = Layout(constants={"kind": "isotonic"})
 
-    statistics: tuple[float, ...]  # Knots, not falling
-    risks: tuple[float, ...]  # Risk at each knot, in [0, 1], not falling
+    statistics: tuple[float, ...]  # Knots, never falling
+    risks: tuple[float, ...]  # Risk at each knot, in [0, 1], never falling
 
     def __post_init__(self) -> None:
         knots = finite_array("statistics", self.statistics, (None,))
@@ -87,14 +87,14 @@ class IsotonicMap:
             raise InvalidArgumentError("risks: expected numbers in [0, 1]")
 
     def __call__(self, statistic: RealT) -> RealT:
-        """Return the risk at a statistic or an array of them."""
+        """Return the risk at one statistic or at an array of statistics."""
         risk = np.interp(statistic, self.statistics, self.risks)
         return float(risk) if np.ndim(statistic) == 0 else risk  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, slots=True)
 class PlattMap:
-    r"""A sigmoid of the statistic's log-odds: two numbers, for small samples.
+    r"""A sigmoid of the statistic's log-odds with two parameters, for small samples.
 
     .. math:: r = 1 / (1 + \exp(a\, \mathrm{logit}(s) + b)), \qquad a \le 0.
     """
@@ -110,7 +110,7 @@ class PlattMap:
             raise InvalidArgumentError(f"slope: expected a number <= 0, got {self.slope}")
 
     def __call__(self, statistic: RealT) -> RealT:
-        """Return the risk at a statistic or an array of them."""
+        """Return the risk at one statistic or at an array of statistics."""
         risk = sigmoid(_logit(np.asarray(statistic, dtype=np.float64)), self.slope, self.offset)
         return float(risk) if np.ndim(statistic) == 0 else risk  # type: ignore[return-value]
 
@@ -137,7 +137,7 @@ def fit_isotonic(statistics: ArrayLike, hazards: ArrayLike) -> IsotonicMap:
 
 
 def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
-    r"""Fit the sigmoid of hazard labels on the log-odds of statistics; a falling fit is held flat.
+    r"""Fit the sigmoid of hazard labels on the log-odds of statistics; a falling fit becomes constant.
 
     .. math:: r = 1 / (1 + \exp(a\, \mathrm{logit}(s) + b)), \qquad a \le 0
 
@@ -147,7 +147,7 @@ def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
     ----------
     J. Platt, "Probabilistic outputs for support vector machines", 1999.
     """
-    # Errors are those of `fit_isotonic`.
+    # The errors are those of `fit_isotonic`.
     scores, labels = _checked_sample(statistics, hazards)
     slope, offset = fit_sigmoid(_logit(scores), labels)
     if slope > 0:
@@ -156,21 +156,20 @@ def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
 
 
 def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float | None = None) -> RiskMap:
-    """Fit Platt's two numbers to a small sample and the isotonic regression to a larger one.
+    """Fit Platt's map to a small sample and the isotonic regression to a larger one.
 
-    Platt's where ``n < 200``.
+    Platt's map is used if ``n < 200``.
 
-    On simulated scores whose true map is a sigmoid Platt is better at every size; where it is another
-    monotone curve isotonic regression overtakes it in Brier score between 80 and 160 independent samples,
-    and either costs at most .003 at 200. That is where the choice changes.
+    On simulated scores whose true map is a sigmoid, Platt's map is better at every size. If the true map is
+    another monotone curve, isotonic regression has the better Brier score from 80 to 160 independent samples
+    on. At 200 samples either choice costs at most 0.003, so the limit is there.
 
     Parameters
     ----------
     statistics, hazards : array_like, shape (n,)
-        As for `fit_isotonic`.
+        See `fit_isotonic`.
     independent : float, optional
-        How many independent samples they are worth; n where not given. Windows of one recording repeat each
-        other.
+        Equivalent number of independent samples, n by default. Windows of one recording are dependent.
 
     Returns
     -------
@@ -180,12 +179,12 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
     Raises
     ------
     InvalidArgumentError
-        As `fit_isotonic`.
+        Under the conditions of `fit_isotonic`.
 
     References
     ----------
-    J. Platt 1999, B. Zadrozny and C. Elkan 2002: see `fit_platt` and `fit_isotonic`; the limit by simulation,
-    as above.
+    J. Platt 1999, B. Zadrozny and C. Elkan 2002: see `fit_platt` and `fit_isotonic`. The limit was found by
+    the simulation above.
 
     Examples
     --------
@@ -209,20 +208,20 @@ def _checked_sample(statistics: ArrayLike, hazards: ArrayLike) -> tuple[FloatArr
     return scores, labels
 
 
-# Ten equal bins, as in the paper; more of them raise the sampling floor.
+# Ten equal bins, as in the paper; more bins increase the ECE of perfectly calibrated labels.
 BINS = 10
 
 
 @dataclass(frozen=True, slots=True)
 class ReliabilityCurve:
-    """Predicted against observed frequency, in the bins that are not empty.
+    """Predicted and observed frequencies in the bins that are not empty.
 
     Parameters
     ----------
     predicted, observed : ndarray, shape (bins,)
-        Mean risk and share of hazards of each bin.
+        Mean risk and share of hazards in each bin.
     counts : ndarray of int, shape (bins,)
-        Windows in each.
+        Number of windows in each bin.
 
     Examples
     --------
@@ -246,19 +245,19 @@ def reliability_curve(risk: ArrayLike, hazards: ArrayLike, bins: int = BINS) -> 
     risk : array_like, shape (n,)
         Predicted probabilities in [0, 1].
     hazards : array_like of bool, shape (n,)
-        What came true.
+        Observed outcomes.
     bins : int
-        How many.
+        Number of bins.
 
     Returns
     -------
     ReliabilityCurve
-        Bins without a window are left out.
+        Without empty bins.
 
     Raises
     ------
     InvalidArgumentError
-        If the sample is empty, the shapes differ or a risk is no probability.
+        If the sample is empty, the shapes differ or a risk is outside [0, 1].
 
     References
     ----------
@@ -284,19 +283,19 @@ def expected_calibration_error(risk: ArrayLike, hazards: ArrayLike, bins: int = 
 
     .. math:: ECE = \sum_b \frac{n_b}{n} \left| \overline{r}_b - \overline{y}_b \right|
 
-    Errors are those of `reliability_curve`.
+    It raises the errors of `reliability_curve`.
 
     Parameters
     ----------
     risk, hazards : array_like, shape (n,)
-        Predicted risk in [0, 1], and 0 or 1.
+        Predicted risk in [0, 1] and outcome, 0 or 1.
     bins : int
-        Of equal width.
+        Number of bins of equal width.
 
     Returns
     -------
     float
-        In [0, 1].
+        Error in [0, 1].
 
     References
     ----------
@@ -316,17 +315,17 @@ def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
 
     .. math:: B = \frac1n \sum_i (r_i - y_i)^2
 
-    Errors are those of `reliability_curve`.
+    It raises the errors of `reliability_curve`.
 
     Parameters
     ----------
     risk, hazards : array_like, shape (n,)
-        Predicted risk in [0, 1], and 0 or 1.
+        Predicted risk in [0, 1] and outcome, 0 or 1.
 
     Returns
     -------
     float
-        In [0, 1].
+        Score in [0, 1].
 
     References
     ----------
@@ -343,7 +342,7 @@ def brier_score(risk: ArrayLike, hazards: ArrayLike) -> float:
 
 
 def brier_skill(risk: ArrayLike, hazards: ArrayLike) -> float | None:
-    r"""Return the share of a constant's Brier score that the risk saves, None where a label is missing.
+    r"""Return the Brier skill against a constant forecast; None if all outcomes are equal.
 
     .. math:: 1 - B / \bar y (1 - \bar y)
 
@@ -352,8 +351,8 @@ def brier_skill(risk: ArrayLike, hazards: ArrayLike) -> float | None:
     >>> brier_skill([0.5, 0.5], [False, True]), brier_skill([0.5, 0.0], [False, True])
     (0.0, -1.5)
     """
-    # The constant is the true share of hazards, not known beforehand. Stated in every window, it has
-    # an ECE of 0: calibration alone is no merit.
+    # The constant is the true share of hazards, which is unknown beforehand. As a forecast it has an ECE of
+    # 0, so calibration alone is not sufficient.
     _, labels = _checked_risk(risk, hazards)
     constant = float(labels.var())
     return 1.0 - brier_score(risk, hazards) / constant if constant else None

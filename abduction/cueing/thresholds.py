@@ -1,4 +1,4 @@
-"""Thresholds of a false-alarm budget, by Neyman and Pearson."""
+"""Neyman-Pearson thresholds for a false-alarm budget."""
 
 from collections.abc import Sequence
 
@@ -11,28 +11,28 @@ from .cueing_policy import sustained_statistic
 
 
 def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sustain_hops: int = 1) -> float:
-    r"""Return the smallest threshold whose sustained alarm keeps its budget on hazard-free recordings.
+    r"""Return the smallest threshold whose sustained alarm stays within its budget on hazard-free recordings.
 
     .. math::
         \gamma(\alpha) = \min \Big\{ \gamma : \frac{1}{N} \sum_t
         1\big[\min(s_{t-k+1}, \dots, s_t) \ge \gamma\big] \le \alpha \Big\}
 
-    over all N windows of all recordings; a run never crosses from one recording into the next. The rate on
-    these windows never exceeds `alpha`, ties included.
+    over all N windows of all recordings; consecutive hops never span two recordings. The rate on these
+    windows never exceeds `alpha`, also with equal statistics.
 
     Parameters
     ----------
     hazard_free : sequence of array_like, each of shape (windows,)
-        Statistics of each hazard-free calibration recording, in the order of time.
+        Statistics of each hazard-free calibration recording, in temporal order.
     alpha : float
         Budget: share of windows in alarm, in [0, 1).
     sustain_hops : int
-        k, consecutive hops that the statistic has to hold.
+        k, the number of consecutive hops for which the statistic has to hold.
 
     Returns
     -------
     float
-        Of the statistic's own scale.
+        Threshold on the scale of the statistic.
 
     Raises
     ------
@@ -54,6 +54,6 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
     held = np.concatenate([np.zeros(0), *(sustained_statistic(one, sustain_hops) for one in streams)])
     if not held.size:
         raise InvalidArgumentError("hazard_free: expected at least one window")
-    # The next float above the first window that the budget cannot pay for.
+    # The next float above the first window that exceeds the budget.
     paid, least = int(budget * held.size * (1.0 + TINY)), float(np.finfo(np.float64).min)
     return least if paid >= held.size else max(float(np.nextafter(np.sort(held)[-1 - paid], np.inf)), least)

@@ -1,1 +1,1 @@
-"""The classifier's scores weighed with physics, "Evidence of Absence", eq. (5)."""
+"""The classifier's scores combined with physical likelihoods, "Evidence of Absence", eq. (5)."""

@@ -4,9 +4,9 @@ r"""Grounded signature likelihoods, eq. (5), and their integral over class and s
     \ell_h(y) = \frac{P(h \mid s)}{\pi_h} \sum_c P(c) \int p(o \mid c, v_r)\, p(\hat v \mid v_r)\,
                 dP(v_r \mid c, h) \int p(\hat\theta \mid \theta)\, dP(\theta \mid h)
 
-The first factor is the calibrated score of any classifier; o are the observables that physics couples to the
-radial speed. All densities are relative to those of a spurious signature, whose own factors are one: where
-nothing beside the feature was measured, the classifier's evidence is handed on unchanged.
+The first factor is the calibrated score of any classifier; o are the observables that depend on the radial
+speed. All densities are relative to those of a spurious signature, whose own factors are one. If only the
+feature was measured, the classifier's evidence is returned unchanged.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -22,26 +22,26 @@ from worldstate.ground.checks import ABOVE_ZERO, MOST, check_fields, freeze_arra
 
 LINE_SPACING = "line_spacing_hz"
 SPEED_OF_SOUND_M_S = 343.0
-# Total ratio of gearbox and final drive, first to fifth gear, in even steps: ordinary numbers of a passenger
-# car (3.6 to 0.85 times 3.9), no measured ones.
+# Total ratio of gearbox and final drive, first to fifth gear, in even steps: typical values of a passenger
+# car (3.6 to 0.85 times 3.9), not measured ones.
 GEAR_RATIOS = tuple(np.geomspace(14.0, 3.3, 5).tolist())
 WHEEL_RADIUS_M = 0.3
 FIRINGS_PER_TURN = 2.0
 IDLE_HZ = 25.0
 _KMH_M_S = 1.0 / 3.6
 REFERENCE_SPEED_M_S, LOWEST_SPEED_M_S = 70.0 * _KMH_M_S, 20.0 * _KMH_M_S
-# Of the quadrature, towards the listener.
+# Grid of the quadrature; a positive speed is towards the array.
 _SPEED_CELL_M_S = 0.5
 _SPEEDS_M_S = np.arange(-5.0, 30.0 + _SPEED_CELL_M_S, _SPEED_CELL_M_S)
-_DECIBELS = 10.0 / np.log(10.0)  # A neper of power
+_DECIBELS = 10.0 / np.log(10.0)  # dB per unit of log power
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coupling:
     r"""An observable that depends on the radial speed.
 
-    A coupling says what an observable of the signature is worth at a given radial speed, as curves over
-    speed. It can be tested by itself and switched off.
+    A coupling gives the expected value of an observable at a radial speed, as curves over speed. It can be
+    tested and switched off separately.
 
     References
     ----------
@@ -49,12 +49,12 @@ class Coupling:
     2015/996 (CNOSSOS-EU), annex, tables of category 1.
     """
 
-    observable: str  # Its name, unit included
-    speed_m_s: FloatArray  # Knots, rising, shape (n,); speed towards the listener is positive
-    # Values at the knots, linear between and constant beyond, shape (curves, n); several if one of them holds
-    # but not known which, such as the gear, all equally likely.
+    observable: str  # Name with its unit
+    speed_m_s: FloatArray  # Knots, rising, shape (n,); positive towards the array
+    # Values at the knots, linear between and constant beyond, shape (curves, n). With several curves, such as
+    # one per gear, it is unknown which one applies; all are equally likely.
     curves: FloatArray
-    std: float  # How far a source of this class scatters about its curve, in the observable's unit, > 0
+    std: float  # Standard deviation of a source of this class about its curve, in the observable's unit, > 0
 
     def __post_init__(self) -> None:
         freeze_arrays(self, speed_m_s=(None,))
@@ -64,7 +64,7 @@ class Coupling:
         check_fields(self, std=(ABOVE_ZERO, MOST))
 
     def expected(self, radial_speed_m_s: ArrayLike) -> FloatArray:
-        r"""Return the value on every curve, shape (curves, n).
+        r"""Return the expected value on every curve, shape (curves, n).
 
         .. math:: f_g(v) = f_{g,i} + (f_{g,i+1} - f_{g,i})\, \frac{v - v_i}{v_{i+1} - v_i}, \qquad
                   v_i \le v \le v_{i+1}
@@ -93,20 +93,20 @@ class Descriptor:
     Parameters
     ----------
     name : str
-        Of the class.
+        Name of the class.
     labels : tuple of str
-        What a camera would report if it were in plain view: the co-evidence that its signature predicts.
+        Labels that a camera would report if it were visible: the expected co-evidence.
     weight : float
         Prior share among all classes, > 0; shares are normalised by the model.
     speed_mean_m_s, speed_std_m_s : float
-        Of the radial speed of one that approaches, a normal law cut off at the model's speeds.
+        Radial speed of an approaching road user: a normal distribution, truncated at the model's speeds.
     couplings : tuple of Coupling
-        At most one for each observable.
+        At most one per observable.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range or an observable is coupled twice.
+        If a number is out of range or two couplings have the same observable.
 
     Examples
     --------
@@ -130,11 +130,11 @@ class Descriptor:
 
 
 def engine_line(std_hz: float = 4.0) -> Coupling:
-    r"""Spacing of the engine's harmonics over speed, one curve a gear.
+    r"""Return the spacing of the engine's harmonics over speed, one curve per gear.
 
     .. math:: f = \max\Big( f_{idle},\ \frac{n_f\, G\, |v|}{2 \pi R} \Big)
 
-    with n_f firings a turn (2 for four cylinders), total ratio G and wheel radius R.
+    with n_f firings per revolution (2 for four cylinders), total ratio G and wheel radius R.
     """
     per_speed = FIRINGS_PER_TURN / (2 * pi * WHEEL_RADIUS_M)
     curves = [np.maximum(IDLE_HZ, per_speed * ratio * np.abs(_SPEEDS_M_S)) for ratio in GEAR_RATIOS]
@@ -142,13 +142,14 @@ def engine_line(std_hz: float = 4.0) -> Coupling:
 
 
 def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
-    r"""Level of the 1 kHz octave above that of 125 Hz: rolling noise takes over from the engine with speed.
+    r"""Return the level of the 1 kHz octave minus that of the 125 Hz octave over speed.
 
     .. math:: \Delta L = L_{1000} - L_{125}, \qquad
               L = 10 \log_{10} \big(10^{L_R / 10} + 10^{L_P / 10}\big)
 
     Each octave is the power sum of :math:`A_R + B_R \log_{10}(v / v_0)` and :math:`A_P + B_P (v - v_0) / v_0`
-    with v_0 = 70 km/h; below 20 km/h, where the method ends, it is held constant.
+    with v_0 = 70 km/h. Rolling noise exceeds engine noise at higher speeds. Below 20 km/h, the lower limit of
+    the method, the level is constant.
     """
     # A_R, B_R, A_P and B_P of category 1 at 125 Hz and at 1 kHz, dB.
     octaves_db = np.array([[85.7, 41.5, 89.2, 7.2], [97.3, 32.5, 84.2, 8.0]])
@@ -161,7 +162,7 @@ def tyre_noise_shape(std_db: float = 3.0) -> Coupling:
 
 
 def doppler_trajectory(std: float = 0.01) -> Coupling:
-    """Ratio of the frequencies heard before and after a pass-by.
+    """Return the ratio of the received frequencies before and after a pass-by, over speed.
 
     .. math:: f_{before} / f_{after} = (c + v) / (c - v)
 
@@ -179,12 +180,12 @@ def doppler_trajectory(std: float = 0.01) -> Coupling:
 
 
 def car() -> Descriptor:
-    """Return a motor vehicle that approaches at town speed, all three couplings in place.
+    """Return a motor vehicle that approaches at urban speed, with all three couplings.
 
     Returns
     -------
     Descriptor
-        With three couplings.
+        Class with three couplings.
 
     Examples
     --------
@@ -196,12 +197,12 @@ def car() -> Descriptor:
 
 
 def motorcycle() -> Descriptor:
-    """Return a motorcycle: as fast as a car, with an engine line of its own gearing left open.
+    """Return a motorcycle: as fast as a car, with unknown gear ratios.
 
     Returns
     -------
     Descriptor
-        With the Doppler coupling only.
+        Class with the Doppler coupling only.
     """
     usual = car()
     open_gearing = ("motorcycle",), 1.0 - usual.weight, usual.speed_mean_m_s, usual.speed_std_m_s
@@ -210,10 +211,10 @@ def motorcycle() -> Descriptor:
 
 @dataclass(frozen=True, slots=True)
 class Observable:
-    """A number with its standard deviation, which comes from a bound or from the estimator itself."""
+    """A value with its standard deviation, which comes from a bound or from the estimator itself."""
 
-    value: float  # In the unit that the name says
-    std: float  # Of the estimate, >= 0
+    value: float  # In the unit that is part of the name
+    std: float  # Standard deviation of the estimate, >= 0
 
     def __post_init__(self) -> None:
         check_fields(self, value=(-MOST, MOST), std=(0.0, MOST))
@@ -224,18 +225,18 @@ NOT_MEASURED = NotUsable("not measured")
 
 @dataclass(frozen=True, slots=True)
 class GroundedObservation:
-    """The front-end's statistics y = (s, theta, v) besides the classifier's scores.
+    """Statistics y = (s, theta, v) of the front-end that supplement the classifier's scores.
 
     Parameters
     ----------
     bearing_rad : Observable or NotUsable
         Azimuth, left positive.
     radial_speed_m_s : Observable or NotUsable
-        From Doppler, positive while closing.
+        Radial speed from Doppler, positive for an approach.
     inverse_tta_hz : Observable or NotUsable
-        From looming, 1/s.
+        Reciprocal of the time to arrival, from looming, 1/s.
     signature : mapping of str to Observable
-        Observables that descriptors couple to speed, such as ``line_spacing_hz``; those that are missing are
+        Observables that depend on speed in a descriptor, such as ``line_spacing_hz``; missing ones are
         marginalised.
 
     Examples
@@ -255,7 +256,7 @@ _AZIMUTH_CELL_RAD = float(np.radians(1.0))
 _RANGES_M = np.geomspace(5.0, 60.0, 24)
 
 
-# Of observables that belong to no source, broad normal laws: all other densities are relative to theirs.
+# Broad normal distributions of observables without a source; all other densities are relative to them.
 BACKGROUNDS = {
     LINE_SPACING: Observable(70.0, 40.0),
     "tyre_shape_db": Observable(0.0, 10.0),
@@ -263,20 +264,19 @@ BACKGROUNDS = {
     "radial_speed_m_s": Observable(0.0, 10.0),
     "inverse_tta_hz": Observable(0.0, 1.0),
 }
-# Deviation of the azimuth of a source in plain view, and of the strongest direction of a hidden one: it is a
-# wall or an edge that is heard, whose side says little of the side that the vehicle comes from.
+# Deviation of the azimuth of a visible source, and of the strongest direction of a hidden one. The sound of a
+# hidden source arrives from a wall or an edge, whose side is hardly related to the side of the vehicle.
 _VISIBLE_STD_RAD, _HIDDEN_STD_RAD = float(np.radians(35.0)), np.inf
 
 
 @dataclass(frozen=True, slots=True)
 class GroundedSettings:
-    """Which observables are used.
+    """Settings that switch observables off.
 
     Parameters
     ----------
     without : frozenset of str
-        Observables that are left out, for ablations: of a coupling, or of the approach rate,
-        `radial_speed_m_s` and `inverse_tta_hz`.
+        Omitted observables, for ablations: those of couplings, `radial_speed_m_s` and `inverse_tta_hz`.
 
     Examples
     --------
@@ -289,7 +289,7 @@ class GroundedSettings:
 
 @dataclass(frozen=True, slots=True)
 class HiddenState:
-    """The state z that explains an observation best under the hidden explanation.
+    """The state z that best explains an observation under the hidden explanation.
 
     Examples
     --------
@@ -297,16 +297,16 @@ class HiddenState:
     ('car',)
     """
 
-    direction: str  # Of `SignatureEvidence.directions`
+    direction: str  # One of `SignatureEvidence.directions`
     entity_class: str  # Name of the descriptor
-    labels: tuple[str, ...]  # What a camera would report of it
+    labels: tuple[str, ...]  # Labels that a camera would report
     azimuth_rad: float  # Most probable values, on the grid of the quadrature
     radial_speed_m_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class GroundedAnswer:
-    """Likelihoods of the explanations, and the best hidden state with its predictions.
+    """Log-likelihoods of the explanations, the best hidden state and the class probabilities.
 
     Parameters
     ----------
@@ -342,28 +342,28 @@ def ground(
               \frac{p(o \mid c, v)\, p(\hat v \mid v)}{p_0}
               + \log \sum_\theta P(\theta \mid h)\, \frac{p(\hat\theta \mid \theta)}{p_0}
 
-    for h hidden or visible, with p_0 the density without a source; that of none is left as it is.
+    for h hidden or visible, with p_0 the density without a source; that of none does not change.
 
     Parameters
     ----------
     evidence : SignatureEvidence
-        The classifier's, from calibrated scores.
+        Evidence of the classifier, from calibrated scores.
     observation : GroundedObservation
-        Bearing, approach and observables with their spreads; what is not usable is marginalised.
+        Bearing, approach and observables with their deviations; unusable values are marginalised.
     descriptors : sequence of Descriptor
-        Classes of road users, at least one, names all different.
+        At least one class of road users, all named differently.
     settings : GroundedSettings, optional
-        Switched-off couplings.
+        Observables that are switched off.
 
     Returns
     -------
     GroundedAnswer
-        Class, speed and evidence after physics.
+        Class, speed and evidence after the physical likelihoods.
 
     Raises
     ------
     InvalidArgumentError
-        If there is no descriptor or a name comes twice.
+        If there is no descriptor or two have the same name.
 
     References
     ----------
@@ -384,7 +384,7 @@ def ground(
     without = settings.without if settings else frozenset[str]()
     approach, weights = _log_approach(observation, without), [one.weight for one in descriptors]
     couplings = np.stack([_log_couplings(observation, one, without) for one in descriptors])
-    # P(c) and P(v_r | c), a normal law on the grid, of every class in a row.
+    # P(c) and P(v_r | c), a normal distribution on the grid, one row per class.
     mean, std = np.array([(one.speed_mean_m_s, one.speed_std_m_s) for one in descriptors]).T[..., None]
     prior = -0.5 * ((_SPEEDS_M_S - mean) / std) ** 2
     prior -= np.logaddexp.reduce(prior, axis=1, keepdims=True)
@@ -395,10 +395,10 @@ def ground(
     moving = np.logaddexp.reduce(per_class)
     hidden = np.array(evidence.hidden) + moving + np.logaddexp.reduce(hidden_azimuth)
     visible = evidence.visible + moving + np.logaddexp.reduce(visible_azimuth)
-    # What no descriptor explains is unlikely without bound.
+    # The log-likelihood of an observation that no descriptor explains has no lower bound.
     *hidden, visible = np.clip([*hidden, visible], -MOST_NATS, MOST_NATS).tolist()
     grounded = SignatureEvidence(evidence.directions, tuple(hidden), visible, evidence.none)
-    # The arg max over the hidden state: its factors part, so each is taken by itself.
+    # The arg max over the hidden state: it factorises, so each factor has its own maximum.
     entity, speed = divmod(int(over_speed.argmax()), _SPEEDS_M_S.size)
     best, direction = descriptors[entity], evidence.directions[int(np.argmax(evidence.hidden))]
     at = float(_AZIMUTHS_RAD[hidden_azimuth.argmax()]), float(_SPEEDS_M_S[speed])
@@ -409,7 +409,7 @@ def ground(
 def _log_couplings(
     observation: GroundedObservation, descriptor: Descriptor, without: Collection[str]
 ) -> FloatArray:
-    """Log of p(o | c, v_r) over the background; an observable that a class leaves open adds nothing."""
+    """Return log p(o | c, v_r) minus the background's; an observable without a coupling adds nothing."""
     total = np.zeros(_SPEEDS_M_S.size)
     for coupling in descriptor.couplings:
         seen = observation.signature.get(coupling.observable)
@@ -420,7 +420,7 @@ def _log_couplings(
 
 
 def _log_approach(observation: GroundedObservation, without: Collection[str]) -> FloatArray:
-    """Log of p(v | v_r) over that of the background: Doppler, else looming with the range marginalised."""
+    """Return log p(v | v_r) minus the background's: Doppler, or looming with the range marginalised."""
     speed, inverse_tta = observation.radial_speed_m_s, observation.inverse_tta_hz
     if isinstance(speed, Observable) and "radial_speed_m_s" not in without:
         return _log_normal(speed, _SPEEDS_M_S, _SPEED_CELL_M_S) - _log_background("radial_speed_m_s", speed)
@@ -433,7 +433,7 @@ def _log_approach(observation: GroundedObservation, without: Collection[str]) ->
 
 
 def _over_azimuth(bearing: Observable | NotUsable, std_rad: float) -> FloatArray:
-    """Log of P(theta | h) p(bearing | theta) over that of any azimuth alike, shape (azimuths,)."""
+    """Return log P(theta | h) p(bearing | theta) relative to a uniform azimuth, shape (azimuths,)."""
     prior: FloatArray = -0.5 * (_AZIMUTHS_RAD / std_rad) ** 2
     prior -= np.logaddexp.reduce(prior)
     if isinstance(bearing, NotUsable):
@@ -447,21 +447,21 @@ def _log_background(name: str, seen: Observable) -> FloatArray:
 
 
 def _log_normal(seen: Observable, expected: FloatArray | float, cell: FloatArray | float) -> FloatArray:
-    """Log density of what was seen; a spread below half a cell of the grid is held there."""
+    """Return the log density of an observable; its deviation is at least half a cell of the grid."""
     std = np.maximum(seen.std, np.asarray(cell) / 2.0)
     return np.asarray(-0.5 * ((seen.value - expected) / std) ** 2 - np.log(std * np.sqrt(2 * pi)))
 
 
 @dataclass(frozen=True, slots=True)
 class Grounding:
-    """Which road users are reckoned with, and which ties between their sound and their motion.
+    """Classes of road users and the couplings between their sound and their motion.
 
     Parameters
     ----------
     descriptors : tuple of Descriptor
-        Classes of road users, at least one.
+        At least one class of road users.
     settings : GroundedSettings
-        Couplings that are switched off.
+        Observables that are switched off.
 
     Examples
     --------
@@ -476,5 +476,5 @@ class Grounding:
     settings: GroundedSettings = field(default_factory=GroundedSettings)
 
     def answer(self, signature: SignatureEvidence, observation: GroundedObservation) -> GroundedAnswer:
-        """Return what `ground` makes of calibrated scores and what else was observed."""
+        """Return the result of `ground` for calibrated scores and the other observations."""
         return ground(signature, observation, self.descriptors, self.settings)

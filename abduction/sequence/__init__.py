@@ -1,1 +1,1 @@
-"""From three seconds of window evidence to what comes into view, when, and on which side."""
+"""Prediction from three seconds of window evidence: whether, when and on which side a vehicle appears."""

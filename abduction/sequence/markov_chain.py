@@ -1,4 +1,4 @@
-"""Groups of a sequence at the prior of a context, and Markov chains in continuous time."""
+"""Posteriors of a sequence at the prior of a context, and Markov chains in continuous time."""
 
 import math
 
@@ -9,13 +9,13 @@ from worldstate.ground import NANOSECONDS_PER_SECOND, TINY, FloatArray
 from .sequence_model import COMING_S
 
 _COMING = len(COMING_S)
-# A wrong prior on both sides slides the alarm: by +2 nats from 15 to 58 onsets an hour, by -1 to a detection
-# of 0.73 in place of 0.94.
+# A wrong prior on both sides acts like a shifted threshold: +2 nats increase the onsets from 15 to 58 per
+# hour, and -1 nat reduces the detection rate from 0.94 to 0.73.
 _LEAST_SHIFT, _LARGEST_SHIFT = -0.5, 2.0
 
 
 def at_prior(posterior: FloatArray, share: FloatArray, prior: FloatArray) -> FloatArray:
-    r"""Return a posterior at another prior than it was trained at, shapes (..., groups).
+    r"""Return a posterior for another prior than the one of its training, shapes (..., groups).
 
     .. math:: q^c \propto q\, c / \pi
 
@@ -29,9 +29,9 @@ def at_prior(posterior: FloatArray, share: FloatArray, prior: FloatArray) -> Flo
 
 
 def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
-    """Return the distribution of one side's groups in a context that expects a hidden vehicle on it.
+    """Return the prior of one side's groups if the context gives a probability of a hidden vehicle there.
 
-    Without one it is the model's share; the shift is bounded.
+    Without this probability it is the model's share. The shift in log-odds is bounded.
 
     Examples
     --------
@@ -42,7 +42,7 @@ def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
     if hidden is None:
         return np.asarray(share / share.sum())
     coming = float(share[:_COMING].sum() / share.sum())
-    # Certainty of a prior has no end, the shift has.
+    # The log-odds of a prior of 0 or 1 are infinite, but the shift must be finite.
     expected = min(max(hidden, TINY), 1.0 - TINY)
     shift = math.log(expected / (1.0 - expected)) - math.log(coming / (1.0 - coming))
     factor = math.exp(min(max(shift, _LEAST_SHIFT), _LARGEST_SHIFT))
@@ -51,12 +51,12 @@ def context_prior(share: FloatArray, hidden: float | None) -> FloatArray:
 
 
 def balanced(chain: FloatArray, share: FloatArray, rounds: int = 2000) -> FloatArray:
-    r"""Return the chain nearest to another one that leaves a distribution as it is.
+    r"""Return the chain closest to a given one with the given stationary distribution.
 
     .. math:: \pi A = \pi
 
     Source: R. Sinkhorn, "A relationship between arbitrary positive matrices and doubly stochastic matrices",
-    Ann. Math. Statist. 35, 1964: flows are scaled by rows and columns in turn.
+    Ann. Math. Statist. 35, 1964: the flows are scaled alternately by rows and columns.
 
     Examples
     --------
@@ -72,9 +72,9 @@ def balanced(chain: FloatArray, share: FloatArray, rounds: int = 2000) -> FloatA
     return np.asarray(flows / flows.sum(axis=1, keepdims=True))
 
 
-# At any rate above .01/s a chain is in equilibrium by then; a larger exponent only costs digits.
+# At rates above 0.01/s a chain is in equilibrium after this time; a larger exponent only loses precision.
 LONGEST_STEP_S = 1000.0
-_MOST_JUMPS = 20  # Of which one is expected: more have less than 1e-18
+_MOST_JUMPS = 20  # With a mean of at most one jump, the probability of more is below 1e-18
 
 
 def transitions(rates_hz: FloatArray, step_ns: int) -> FloatArray:
@@ -83,10 +83,10 @@ def transitions(rates_hz: FloatArray, step_ns: int) -> FloatArray:
     .. math:: e^{Q t} = \Big( \sum_n e^{-m} \frac{m^n}{n!} J^n \Big)^{2^h}, \qquad
               J = I + \frac{Q t}{2^h m}, \quad m = \frac{\max_i -Q_{ii} t}{2^h} \le 1
 
-    As no term is negative, all have their digits.
+    All terms are non-negative, so no precision is lost.
 
     Source: A. Jensen, "Markoff chains as an aid in the study of Markoff processes", Scand. Actuar. J., 1953
-    (uniformisation). By numpy: scipy.linalg takes longer to import than numpy.
+    (uniformisation). It uses numpy, because scipy.linalg takes longer to import than numpy.
 
     Examples
     --------

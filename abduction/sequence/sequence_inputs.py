@@ -1,8 +1,8 @@
-r"""What a sequence model reads: each side's evidence, how it changed, and what else the sound did.
+r"""Inputs of a sequence model: the evidence of each side, its change, and further properties of the sound.
 
-One row a hop and side, from the hop itself and those up to eight seconds before it: three for what is heard,
-eight for what the loudest vehicle of late has left. The right side is mirrored onto the left, so that one
-model serves both. Where less than that was heard, the oldest hop stands in.
+There is one row per hop and side. It is computed from the hop and from earlier ones: up to three seconds for
+the evidence, up to eight for the after-effects of the loudest recent vehicle. The right side is mirrored, so
+that one model serves both sides. If the history is shorter, its oldest hop replaces the missing ones.
 """
 
 import numpy as np
@@ -13,18 +13,19 @@ from worldstate.ground.values import mean, part_means
 _SECOND = 10  # hops
 _HALF, _TWO, _THREE = _SECOND // 2, 2 * _SECOND, _SECOND + 2 * _SECOND
 _FOUR, _SIX = 2 * _TWO, 2 * _THREE
-RECENT_HOPS, MEMORY_HOPS = _THREE + 1, 2 * _FOUR + 1  # three seconds, eight, and the hop itself
-QUIET_HOPS = _SIX * _SECOND  # a minute
-# The street's own level is what the quietest fifth of the last minute stays below, its own evidence what half
-# of the minute does: another junction moves both, and a vehicle a few seconds long neither.
+RECENT_HOPS, MEMORY_HOPS = _THREE + 1, 2 * _FOUR + 1  # Three and eight seconds, and the hop itself
+QUIET_HOPS = _SIX * _SECOND  # One minute
+# The street's usual level is the 20 % quantile of the last minute, and its usual evidence the median. Both
+# differ between junctions, and a vehicle that passes within a few seconds does not change them.
 QUIET_SHARE, USUAL_SHARE = 0.2, 0.5
-# Groups of neighbouring bands, read as means over so many hops more. Behind a corner sound is dull: the
-# nearer a vehicle comes to the edge, the more of its high frequencies come round it, and they go first when
-# it has passed. At junctions left out, Brier skill at 3 s .265 without, .273 with the four levels above the
-# street's own, .293 with their changes, too; time to visible .756, .751, .727 of the constant's error.
+# Groups of neighbouring bands; a value is the mean over the hop and this many before it. Sound from behind a
+# corner lacks high frequencies; they increase as the vehicle approaches the edge and decrease first after it
+# has passed. At junctions outside the training set, the Brier skill at 3 s is 0.265 without bands, 0.273 with
+# the four levels relative to the street's and 0.293 with their changes as well; the error of the time to
+# visible is 0.756, 0.751 and 0.727 of the constant's.
 BANDS, _BAND_HOPS = 4, 3
 SIDES = ("left", "right")
-_UNKNOWN_HZ = 10.0  # Deviation of an approach rate of which nothing is known
+_UNKNOWN_HZ = 10.0  # Standard deviation of an unknown approach rate
 HOP_S = 1.0 / _SECOND
 
 
@@ -33,7 +34,7 @@ _BAND_INPUTS = tuple(f"{name}{before}" for before in ("", "_1s", "_2s") for name
 INPUTS = (
     *("this", "this_above", "this_1s", "this_2s", "this_before", "this_highest"),
     *("other", "other_above", "other_1s", "other_2s", "other_highest"),
-    # One hop hardly tells the sides apart; what it leans to over seconds does.
+    # A single hop hardly separates the sides; the mean over seconds does.
     *("this_mean", "other_mean", "lean", "lean_1s", "lean_3s"),
     *("visible", "visible_above", "visible_1s", "visible_2s", "visible_highest"),
     *("level", "level_1s", "level_2s"),
@@ -42,10 +43,11 @@ INPUTS = (
     *("approach", "approach_std"),
     *("bearing", "bearing_1s", "bearing_spread"),
     *_BAND_INPUTS,
-    # A vehicle in view masks the rest for some three seconds, which the memory has to outlast: how long the
-    # loudest hop is past, how far below it the level is, by how much it has risen again. Sixteen junctions
-    # left out in turn, vehicles up to 6 s apart: Brier skill at 3 s .215 without, .234 with them, detected
-    # at 20 onsets an hour .73, .77; AUROC of a second one from the other side that adds 1 dB .72, .78.
+    # A visible vehicle masks others for about three seconds, so these inputs cover more: the time since the
+    # loudest hop, the level below it and the rise since then. With them, over sixteen left-out junctions with
+    # vehicles up to 6 s apart, the Brier skill at 3 s is 0.234 (was 0.215), the detection rate at 20 onsets
+    # per hour 0.77 (was 0.73), and the AUROC of a second vehicle from the other side that adds 1 dB 0.78 (was
+    # 0.72).
     *("since_loudest", "below_loudest", "above_dip", "loudness_half", "loudness_4s", "loudness_6s"),
     *(f"{name}_half" for name in _BANDS),
     *("visible_highest_8s", "visible_below_8s", "since_visible"),
@@ -54,9 +56,10 @@ INPUTS = (
 )
 
 
-# What is kept of a hop: log ratios of either side and of visible, nats; mean of the log of the 60 values,
-# mean log energy of the bands, log of the peak-to-median ratio; 1/TTA, its deviation, bearing, left positive;
-# log energy of four groups of neighbouring bands, low ones first. The first five change, three have a top.
+# Stored values of a hop: log ratios of left, right and visible, nats; mean log of the 60 feature values, mean
+# log energy of the bands, log of the peak-to-median ratio; 1/TTA, its deviation, bearing, left positive;
+# log energy of four groups of neighbouring bands, low ones first. Inputs hold changes of the first five and
+# maxima of the first three.
 COLUMNS = (
     *("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing"),
     *_BANDS,
@@ -65,11 +68,11 @@ _OF_LEVEL = COLUMNS[COLUMNS.index("level") : -BANDS]
 _HIGHEST, _LOUDNESS, _PROMINENCE, _RATE, _SPREAD, _BEARING = map(COLUMNS.index, _OF_LEVEL)
 _CHANGING = _LOUDNESS + 1
 _BAND_COLUMNS = slice(_BEARING + 1, _BEARING + 1 + BANDS)
-# What eight seconds are kept of: the level, both sides and the visible; the first three have a dip.
+# Values with a memory of eight seconds: the level, both sides and visible; the first three have a minimum.
 _FOLLOWED = [_LOUDNESS, *range(_HIGHEST)]
 _EACH = np.arange(len(_FOLLOWED))
 _CHANGED = [_LOUDNESS, *range(_BAND_COLUMNS.start, _BAND_COLUMNS.stop), 0, 1]
-# What of it is usual in the street: levels that the quietest fifth stays below, then evidence.
+# Values with a usual value in the street: first levels (20 % quantile), then evidence (median).
 USUAL = (*_BANDS, "level", "loudness", "left", "right", "visible")
 _LEVELS = BANDS + 2
 _EVERY = (
@@ -113,15 +116,15 @@ def hop_columns(
     looming_std_hz: FloatArray,
     bearing_rad: FloatArray,
 ) -> FloatArray:
-    """Return the evidence of hops, one a row without gaps, shape (n, 13), as `COLUMNS` names them.
+    """Return the columns of consecutive hops, one row per hop, shape (n, 13), in the order of `COLUMNS`.
 
-    The only way from the window model and the front-end to a sequence: a model that learns one and reads
-    another is worth nothing. `sides`, shape (n, 2), are log ratios of hidden on the left and on the right to
-    visible or none, `visible` that of visible to none. NaN is a looming rate or a bearing that was refused.
+    Training and operation both use this function, because a model needs the inputs that it was trained on.
+    `sides`, shape (n, 2), are the log ratios of hidden on the left and on the right to visible or none;
+    `visible` is the log ratio of visible to none. A looming rate or a bearing is NaN if it was not usable.
     """
-    # In double precision: streams on disk keep half of it, and its logarithm would have the other half's.
+    # In double precision: files store the energy in half precision, and so would be its logarithm.
     energy = np.asarray(band_log_energy, np.float64)
-    # Where nothing could be read the rate is 0 and its deviation that of knowing nothing.
+    # An unusable rate becomes 0 with the deviation of an unknown rate.
     refused = ~np.isfinite(looming_hz)
     single = [
         visible,
@@ -136,7 +139,7 @@ def hop_columns(
 
 
 def streets_own(columns: FloatArray) -> FloatArray:
-    """Return the columns whose usual values are kept for a minute, as `USUAL` names them."""
+    """Return the columns whose usual values over a minute are used, in the order of `USUAL`."""
     return np.asarray(columns[:, _OWN])
 
 
@@ -149,13 +152,13 @@ def sequence_inputs(columns: FloatArray) -> FloatArray:
     True
     """
     own, ends = streets_own(columns), range(1, len(columns) + 1)
-    # Each hop as a reader reads it: a model is trained on what it is given later, to the bit.
+    # With the same function as a reader, so that training and operation agree to the bit.
     rows = [last_inputs(columns[max(n - MEMORY_HOPS, 0) : n], own[max(n - QUIET_HOPS, 0) : n]) for n in ends]
     return np.concatenate(rows) if rows else np.zeros((0, len(SIDES), len(INPUTS)))
 
 
 def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
-    """Return the inputs of the last hop, shape (1, 2, inputs), from what is kept of a stream.
+    """Return the inputs of the last hop, shape (1, 2, inputs), from the stored hops of a stream.
 
     Shapes: recent (up to 81, 13), minute (up to 600, 9).
     """
@@ -190,11 +193,11 @@ def last_inputs(recent: FloatArray, minute: FloatArray) -> FloatArray:
 
 
 def _remembered(whole: FloatArray) -> list[FloatArray]:
-    """Return what eight seconds show beside three, in the order of `_EVERY`."""
+    """Return the inputs from eight seconds, in the order of `_EVERY`."""
     last = len(whole) - 1
 
     def before(hops: int) -> FloatArray:
-        """Return the mean of the three hops that end so long ago."""
+        """Return the mean of the three hops that ended this many hops ago."""
         end = max(last - hops, 0) + 1
         rows = whole[max(end - _BAND_HOPS, 0) : end]
         return np.asarray(np.add.reduce(rows) / len(rows))
@@ -217,7 +220,7 @@ def _remembered(whole: FloatArray) -> list[FloatArray]:
 
 
 def _ranked(values: FloatArray, share: float) -> FloatArray:
-    """Return the value of each column that a share of its rows stays below."""
+    """Return the quantile of each column, shape (columns,)."""
     rank = int(share * (len(values) - 1))
     ordered = values.copy()
     ordered.partition(rank, axis=0)

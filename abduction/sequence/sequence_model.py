@@ -1,8 +1,9 @@
-r"""What the last seconds say of each side: will something come into view, when, or is it something else.
+r"""Prediction from the last seconds: whether and when a vehicle comes into view on each side.
 
-Boosted trees sort every hop and side into groups: a vehicle that comes into view within so many seconds, one
-that is far off and grows louder or fainter, one in view, one that has left the view, one that comes on the
-other side, no vehicle. With q the posterior of the groups at the share of hazards in training,
+Boosted trees classify every hop and side into groups: a vehicle that comes into view within a given number of
+seconds, a distant vehicle that becomes louder or quieter, a visible vehicle, one that has left the view, one
+that comes on the other side, or no vehicle. With q the posterior of the groups at the share of hazards in
+training,
 
 .. math:: P(T \le h) = \sum_{g:\, T_g \le h} q_g, \qquad
           \hat T = \frac{\sum_{g\ \mathrm{coming}} q_g t_g}{\sum_{g\ \mathrm{coming}} q_g}
@@ -21,13 +22,13 @@ from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 
 from .sequence_inputs import INPUTS, SIDES, sequence_inputs
 
-# A file from elsewhere must not ask for any amount of work; a leaf of 64 is a bit of a word.
+# Limits on the work that a foreign file can cause; 64 leaves fit the bits of a word.
 MOST_TREES, MOST_NODES, MOST_INPUTS = 4096, 127, 512
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoostedTrees:
-    r"""Trees of several classes side by side, padded to one length.
+    r"""Trees of several classes, padded to equal length.
 
     .. math:: P(c \mid x) = \mathrm{softmax}_c \Big( b_c + \sum_{t \in T_c} v_t(x) \Big)
 
@@ -36,13 +37,13 @@ class BoostedTrees:
     Source: J. H. Friedman, "Greedy function approximation: a gradient boosting machine", Ann. Statist. 29,
     2001.
 
-    A node is a question, ``x[split] <= threshold``, that leads to the node `yes` or `no`, or a leaf, which
-    leads to itself. A child stands behind its parent, and has one.
+    A node is either a test, ``x[split] <= threshold``, that leads to the node `yes` or `no`, or a leaf, which
+    leads to itself. A child has one parent and a higher number than its parent.
 
-    All questions are asked at once, those that several trees ask once. Of the leaves of a tree in the order
-    from `yes` to `no`, an answer "no" rules out those on its `yes` side; x reaches the first that is left.
-    C. Lucchese et al., "QuickScorer: a fast algorithm to rank documents with additive ensembles of regression
-    trees", SIGIR 2015.
+    All tests are evaluated at once; equal tests of several trees are evaluated once. The leaves of a tree
+    are ordered from `yes` to `no`. The result "no" excludes the leaves on the `yes` side; x reaches the first
+    leaf that remains. Source: C. Lucchese et al., "QuickScorer: a fast algorithm to rank documents with
+    additive ensembles of regression trees", SIGIR 2015.
 
     Examples
     --------
@@ -52,15 +53,15 @@ class BoostedTrees:
     [[-1.0, 0.0], [1.0, 0.0]]
     """
 
-    split: IndexArray  # shape (trees, nodes): Which input is asked for
+    split: IndexArray  # shape (trees, nodes): Number of the tested input
     threshold: FloatArray  # shape (trees, nodes)
-    yes: IndexArray  # shape (trees, nodes): Where to go if the input is not above it
-    no: IndexArray  # shape (trees, nodes)
-    value: FloatArray  # shape (trees, nodes): Of leaves
-    tree_class: IndexArray  # shape (trees,): Which class's score a tree adds to
+    yes: IndexArray  # shape (trees, nodes): Next node if the input is not above the threshold
+    no: IndexArray  # shape (trees, nodes): Next node otherwise
+    value: FloatArray  # shape (trees, nodes): Values of leaves
+    tree_class: IndexArray  # shape (trees,): Class to whose score a tree contributes
     baseline: FloatArray  # shape (classes,)
-    # Of what all trees ask, each once: which input, and the threshold. By questions of the trees side by side
-    # which of these it is, and the bits of the leaves that are left after "no"; then the leaves.
+    # Different tests of all trees: input and threshold. Per test of a tree: its number among the different
+    # ones, and the bits of the leaves that remain after "no". Then the values of the leaves.
     _asked: IndexArray = field(init=False, repr=False)  # shape (different ones,)
     _limit: FloatArray = field(init=False, repr=False)  # shape (different ones,)
     _which: IndexArray = field(init=False, repr=False)  # shape (questions, trees)
@@ -79,7 +80,7 @@ class BoostedTrees:
         here = np.arange(nodes)
         for name in ("yes", "no"):
             to = getattr(self, name)
-            # Backwards a walk might never end; a leaf leads to itself.
+            # With links to earlier nodes an evaluation might never end; a leaf leads to itself.
             if to.shape != grid or (to < here).any() or (to >= nodes).any():
                 raise InvalidArgumentError(f"{name}: expected the numbers of later nodes, shape {grid}")
         if ((self.yes == here) != (self.no == here)).any():
@@ -92,7 +93,7 @@ class BoostedTrees:
         self._order_leaves(self.yes != here)
 
     def _order_leaves(self, asks: BoolArray) -> None:
-        """Give every leaf its bit, and every question those that it leaves; asks has shape (trees, nodes)."""
+        """Assign a bit to every leaf and a mask to every test; asks has shape (trees, nodes)."""
         (trees, nodes), tree = asks.shape, np.arange(len(asks))
         led_to = np.concatenate([(way + nodes * tree[:, None])[asks] for way in (self.yes, self.no)])
         if np.bincount(led_to, minlength=1).max() > 1:
@@ -111,7 +112,7 @@ class BoostedTrees:
         at = np.cumsum(reached, axis=1)[row, node] - 1, row
         word = np.min_scalar_type(2**most - 1)
         shape = max(int(reached.sum(axis=1).max()), 1), trees
-        # What a tree has no question for leaves all.
+        # A tree with fewer tests than others is padded with tests that exclude no leaf.
         asked, limit = np.zeros(shape, np.intp), np.full(shape, np.inf)
         left, leaves = np.full(shape, 2**most - 1, word), np.zeros((trees, most))
         asked[at], limit[at] = self.split[row, node], self.threshold[row, node]
@@ -131,58 +132,58 @@ class BoostedTrees:
         """Return the sums before the softmax, shape (n, inputs) -> (n, classes)."""
         classes, (trees, leaves) = len(self.baseline), self._leaves.shape
         ends = np.empty((len(X), trees), np.intp)
-        # Row by row, what a row takes stays in the cache.
+        # Row by row, so that the data of a row stay in the cache.
         for row, end in zip(X, ends, strict=True):
             yes = -(row.take(self._asked) <= self._limit).astype(self._left.dtype)
             left = np.bitwise_and.reduce(self._left | yes.take(self._which), axis=0)
-            # The lowest bit alone is a power of two.
+            # A number with only its lowest bit set is a power of two.
             end[:] = np.frexp((left & -left).astype(np.float64))[1]
         ends += np.arange(trees) * leaves - 1
-        # Counted class by class: a product with a matrix of ones takes longer, and its sum of one row differs
-        # from that of the same row among others.
+        # `bincount`, because a matrix product with ones takes longer, and its rounding of a row depends on
+        # the number of rows.
         bins = np.arange(len(X))[:, None] * classes + self.tree_class
         sums = np.bincount(bins.ravel(), self._leaves.take(ends).ravel(), len(X) * classes)
         return np.asarray(self.baseline + sums.reshape(-1, classes))
 
 
-# Ends of the groups of vehicles that come, seconds before line of sight; what is further off is far.
+# Upper limits of the groups of coming vehicles, seconds before line of sight; later ones are distant.
 COMING_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0)
 OTHERS = ("seen", "other", "past", "rising", "falling", "none")
 GROUPS = (*(f"coming_{end_s:g}s" for end_s in COMING_S), *OTHERS)
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
-# Times are stated of vehicles that come within so long: beyond, nothing in the sound says when.
+# Times are given for vehicles that come within this time; beyond it, the sound does not reveal the time.
 LONGEST_S = 5.0
-STATED = COMING_S.index(LONGEST_S) + 1  # So many groups
+STATED = COMING_S.index(LONGEST_S) + 1  # Number of groups with a time
 _HORIZONS = [COMING_S.index(end_s) for end_s in HORIZONS_S]
-TAIL = 0.05  # Of either end: intervals hold nine of ten
+TAIL = 0.05  # Probability beyond each end: intervals contain nine of ten
 _LEVELS = np.array([[TAIL], [1.0 - TAIL]])
 SMOOTHED_HOPS, HELD_HOPS = 3, 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequencePosterior:
-    """What is believed of both sides, at every hop."""
+    """Posterior of both sides at every hop."""
 
     groups: FloatArray  # shape (n, 2, groups)
     margin_s: float
 
     def within(self) -> FloatArray:
-        """Return the probability of coming into view within each of `HORIZONS_S`, shape (n, 2, 4)."""
+        """Return the probability that a vehicle comes into view within `HORIZONS_S`, shape (n, 2, 4)."""
         sums = np.cumsum(self.groups[..., : len(COMING_S)], axis=-1)[..., _HORIZONS]
-        # Rounding may take a sum of probabilities above one, which readers of files refuse.
+        # Rounding may lead to a sum of probabilities above one, which readers of files reject.
         return np.asarray(np.minimum(sums, 1.0))
 
     def time_to_visible_s(self) -> FloatArray:
-        """Return the time to visible of what comes within five seconds: low, mean, high, shape (n, 2, 3).
+        """Return the time to visible of vehicles within five seconds: low, mean, high, shape (n, 2, 3).
 
-        The interval holds nine of ten of the times that it was calibrated on.
+        On the calibration data the interval contains nine of ten times.
         """
         mass = self.groups[..., :STATED]
         edges = np.array([0.0, *COMING_S[:STATED]])
         share = mass / np.maximum(mass.sum(axis=-1, keepdims=True), TINY)
         mean = share @ (0.5 * (edges[1:] + edges[:-1]))
         below = np.cumsum(share, axis=-1) - share
-        # Of every bin the part that lies below the level, linear within the bin.
+        # The part of every bin that is below the level, linear within the bin.
         parts = (_LEVELS - below[..., None, :]) / np.maximum(share[..., None, :], TINY)
         low, high = np.moveaxis(np.clip(parts, 0.0, 1.0) @ np.diff(edges), -1, 0)
         return np.stack([np.maximum(low - self.margin_s, 0.0), mean, high + self.margin_s], axis=-1)
@@ -190,16 +191,16 @@ class SequencePosterior:
 
 @dataclass(frozen=True, slots=True)
 class AlarmPromise:
-    """Alarms of hazard-free streams at one threshold of a curve; its intervals are for other junctions.
+    """Alarms of hazard-free streams at one threshold of a curve; the intervals are for other junctions.
 
     Parameters
     ----------
     onsets_per_hour : float
-        Alarms that began, the most at this threshold or a higher one.
+        Onsets of alarms per hour, the maximum over this and higher thresholds.
     onsets_low, onsets_high : float
-        95 % interval of the mean rate at four other junctions; at one alone it differs more.
+        95 % interval of the mean rate at four other junctions; a single junction varies more.
     alpha, alpha_low, alpha_high : float
-        Share of the hops in alarm, with its interval.
+        Share of the hops in alarm with its interval.
 
     Examples
     --------
@@ -217,32 +218,33 @@ class AlarmPromise:
 
 @dataclass(frozen=True, slots=True)
 class SequenceAlarm:
-    """When a side is in alarm: log-odds of coming into view within three seconds, smoothed and held."""
+    """Alarm of a side: smoothed and held log-odds that a vehicle comes into view within three seconds."""
 
-    threshold_nats: float  # Of the mean log-odds of .3 s
-    onsets_per_hour: float  # Budget: what was asked, or the curve's promise if a share was asked
-    asked_alpha: Probability | None = field(default=None, metadata=ADDED)  # In place of a budget
+    threshold_nats: float  # Threshold of the log-odds, averaged over 0.3 s
+    onsets_per_hour: float  # Requested budget, or the expected rate if a share was requested
+    asked_alpha: Probability | None = field(default=None, metadata=ADDED)  # Requested share of hops in alarm
     promise: AlarmPromise | None = field(default=None, metadata=ADDED)  # None if no curve was measured
 
 
 def _last(rates: FloatArray, most: float) -> int:
-    """Return the last point whose rate is not above a number but for what was rounded."""
+    """Return the last point whose rate does not exceed a number, within rounding."""
     return int(np.searchsorted(rates, most * (1.0 + TINY), side="right")) - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlarmCurve:
-    r"""From a budget to the threshold, measured on hazard-free streams: points of ever lower thresholds.
+    r"""Thresholds for budgets, measured on hazard-free streams: points with decreasing thresholds.
 
     .. math:: \gamma(b) = \min \{ \gamma_i : r_i \le b \}, \qquad
               \gamma(\alpha) = \min \{ \gamma_i : \alpha_i \le \alpha \}
 
-    with r the onsets an hour, the most at a threshold or a higher one, and the share of hops in alarm.
+    with r the onsets per hour, the maximum over this and higher thresholds, and alpha the share of hops in
+    alarm.
 
     Raises
     ------
     InvalidArgumentError
-        If the arrays differ in length, a threshold does not fall or a rate does.
+        If the lengths of the arrays differ, the thresholds do not decrease or a rate decreases.
 
     Examples
     --------
@@ -254,18 +256,18 @@ class AlarmCurve:
     >>> curve.for_budget(1.0)
     Traceback (most recent call last):
         ...
-    worldstate...InvalidArgumentError: budget: expected 4 to 20 onsets an hour, ... supports, got 1
+    worldstate...InvalidArgumentError: budget: expected 4 to 20 onsets per hour, ... supports, got 1
     """
 
     threshold_nats: FloatArray  # shape (points,)
-    onsets_per_hour: FloatArray  # shape (points,): The most so far: alarms that grow together count as one
+    onsets_per_hour: FloatArray  # shape (points,): Maximum so far, as alarms may merge at lower thresholds
     onsets_low: FloatArray  # shape (points,): 95 % interval at four other junctions
     onsets_high: FloatArray  # shape (points,)
     alpha: FloatArray  # shape (points,): Share of the hops in alarm
     alpha_low: FloatArray  # shape (points,)
     alpha_high: FloatArray  # shape (points,)
-    hours: float  # Of hazard-free streams
-    least_onsets: float  # A budget is too small if fewer are expected in these hours: chance would decide
+    hours: float  # Duration of the hazard-free streams
+    least_onsets: float  # A budget with fewer expected onsets in these hours would be set by chance
 
     def __post_init__(self) -> None:
         thresholds, *names = (one.name for one in fields(self)[:-2])
@@ -282,29 +284,29 @@ class AlarmCurve:
         return AlarmPromise(*(float(getattr(self, one.name)[point]) for one in fields(AlarmPromise)))
 
     def for_budget(self, onsets_per_hour: float) -> SequenceAlarm:
-        """Return the alarm with the lowest threshold that has no more onsets an hour than this.
+        """Return the alarm with the lowest threshold within a budget of onsets per hour.
 
         Raises
         ------
         InvalidArgumentError
-            If the hours of the curve expect fewer than its least onsets, or no point has as many.
+            If the budget has fewer than the least onsets in the hours of the curve, or is above the curve.
         """
         least = self.least_onsets / self.hours
-        self._check("budget", onsets_per_hour, self.onsets_per_hour, least, "onsets an hour")
+        self._check("budget", onsets_per_hour, self.onsets_per_hour, least, "onsets per hour")
         return self.default(onsets_per_hour)
 
     def default(self, onsets_per_hour: float) -> SequenceAlarm:
-        """Return the alarm for the budget that a model file is made with, however few hours it has."""
+        """Return the alarm for the budget of a new model file, without a limit on the hours."""
         point = max(_last(self.onsets_per_hour, onsets_per_hour), 0)
         return SequenceAlarm(float(self.threshold_nats[point]), onsets_per_hour, None, self._promise(point))
 
     def for_alpha(self, alpha: float) -> SequenceAlarm:
-        """Return the alarm with the lowest threshold at which no more of the hazard-free hops are in alarm.
+        """Return the alarm with the lowest threshold for a share of hazard-free hops in alarm.
 
         Raises
         ------
         InvalidArgumentError
-            If the curve has fewer than its least onsets at that share, or no point has as much.
+            If the curve has fewer than the least onsets at that share, or the share is above the curve.
         """
         too_few = (1.0 - 2.0 * TINY) * self.least_onsets / self.hours
         known = self.alpha[_last(self.onsets_per_hour, too_few) + 1 :]
@@ -322,20 +324,20 @@ class AlarmCurve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceModel:
-    """Trees over the groups, the shares that they were trained at, and how far times may be off."""
+    """Boosted trees over the groups, the groups' shares in training and a margin of the times."""
 
     LAYOUT: ClassVar = Layout(constants={"groups": list(GROUPS)})
 
     trees: BoostedTrees
-    share: FloatArray  # shape (groups,): Of hops and sides of the streams that it was trained on
-    margin_s: float = 0.0  # Beyond the trees' own interval, so that it holds nine of ten
-    alarm: SequenceAlarm | None = None  # That decides; of a file the one that is taken if none is asked for
-    inputs: tuple[str, ...] = INPUTS  # The first of them; a model learned before others were added has fewer
-    curve: AlarmCurve | None = field(default=None, metadata=ADDED)  # Files of 0.3 hold one alarm alone
+    share: FloatArray  # shape (groups,): Shares of the groups in the training streams
+    margin_s: float = 0.0  # Added to the trees' interval so that it contains nine of ten times
+    alarm: SequenceAlarm | None = None  # The alarm in use; in a file, the default
+    inputs: tuple[str, ...] = INPUTS  # An initial part of `INPUTS`: older models have fewer inputs
+    curve: AlarmCurve | None = field(default=None, metadata=ADDED)  # Files of version 0.3 hold one alarm only
 
     def __post_init__(self) -> None:
         freeze_arrays(self, share=(len(GROUPS),))
-        # A posterior is moved to another prior by dividing by it.
+        # The change to another prior divides by it.
         if (self.share <= 0.0).any():
             raise InvalidArgumentError(f"share: expected positive numbers, got {self.share.min()}")
         if self.inputs != INPUTS[: len(self.inputs)]:
@@ -346,16 +348,16 @@ class SequenceModel:
             raise InvalidArgumentError(f"trees: expected {expected}, got {read} and {groups}")
 
     def asking(self, budget: float | None = None, alpha: float | None = None) -> "SequenceModel":
-        """Return the model with the alarm for a budget, onsets an hour, or a share of hazard-free hops.
+        """Return the model with the alarm for a budget of onsets per hour or a share of hazard-free hops.
 
         Raises
         ------
         InvalidArgumentError
-            If both are given, or the curve does not support it; without a curve the alarm of the file has the
-            only budget.
+            If both are given, or the curve does not support the value. Without a curve the only budget is
+            that of the file's alarm.
         """
         if budget is not None and alpha is not None:
-            raise InvalidArgumentError("budget, alpha: expected one of them, each sets the threshold")
+            raise InvalidArgumentError("budget, alpha: expected one of them, because both set the threshold")
         if self.curve is not None and alpha is not None:
             return replace(self, alarm=self.curve.for_alpha(alpha))
         if self.curve is not None and budget is not None:
@@ -364,15 +366,15 @@ class SequenceModel:
         if alpha is None and budget in (None, only):
             return self
         name, held = "budget" if alpha is None else "alpha", "none" if only is None else f"only {only:g}"
-        problem = f"expected a model file with a curve of budgets, this one holds {held} onsets an hour"
-        raise InvalidArgumentError(f"{name}: {problem}: `worldstate model make` writes one with a curve")
+        problem = f"expected a model file with a curve of budgets, this one holds {held} onsets per hour"
+        raise InvalidArgumentError(f"{name}: {problem}; `worldstate model make` writes a file with a curve")
 
     def posterior(self, columns: FloatArray) -> SequencePosterior:
-        """Return what is believed at every hop of a stream, `hop_columns`, by what was heard until then."""
+        """Return the posterior at every hop of a stream from its `hop_columns` up to that hop."""
         return self.of_inputs(sequence_inputs(columns))
 
     def of_inputs(self, inputs: FloatArray) -> SequencePosterior:
-        """Return what is believed by rows of inputs, shape (n, 2, inputs)."""
+        """Return the posterior from rows of inputs, shape (n, 2, inputs)."""
         scores = self.trees.scores(inputs.reshape(-1, inputs.shape[-1]))
         exponent = np.exp(scores - np.maximum.reduce(scores, 1)[:, None])
         groups = exponent / np.add.reduce(exponent, 1)[:, None]

@@ -1,4 +1,4 @@
-"""A sequence model read hop by hop: what is kept of a stream, and what its last hop says of both sides."""
+"""A sequence model applied hop by hop: the stored part of a stream and the posterior of both sides."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,15 +13,15 @@ from . import sequence_inputs as inputs
 from .sequence_model import GROUPS, HELD_HOPS, SequenceAlarm, SequenceModel
 from .street_sides import StreetListener
 
-# Before, what is usual in a street is what was heard just now.
+# With fewer hops, the usual values of a street would be those of the current sound.
 LEAST_HOPS = HELD_HOPS
-_ROUNDING = 1e-5  # By which probabilities may miss a sum of one
+_ROUNDING = 1e-5  # Tolerated error of the sum of probabilities
 TOO_FEW = NotUsable(f"less than {LEAST_HOPS} hops of evidence")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceHistory:
-    """What is kept of a stream: three seconds of its evidence, a minute of what is usual in its street.
+    """Stored part of a stream: eight seconds of its evidence and a minute of values usual in its street.
 
     Examples
     --------
@@ -29,10 +29,10 @@ class SequenceHistory:
     0
     """
 
-    # shapes (up to 81, 13), as `hop_columns`, and (up to 600, 9), as `streets_own`; the last hop last
+    # Shapes (up to 81, 13), see `hop_columns`, and (up to 600, 9), see `streets_own`; the last hop is last.
     recent: FloatArray = field(default_factory=partial(np.zeros, (0, len(inputs.COLUMNS))))
     minute: FloatArray = field(default_factory=partial(np.zeros, (0, len(inputs.USUAL))))
-    missed: Count = field(default=0, metadata=ADDED)  # Hops since the last one that was heard
+    missed: Count = field(default=0, metadata=ADDED)  # Hops since the last usable one
 
     def __post_init__(self) -> None:
         # An empty list in a file has no second axis.
@@ -45,20 +45,20 @@ class SequenceHistory:
 
     @property
     def hops(self) -> int:
-        """Number of hops that are kept, up to eight seconds of them."""
+        """Number of stored hops, at most those of eight seconds."""
         return len(self.recent)
 
     def missed_hop(self) -> "SequenceHistory":
-        """Return the history one hop on that could not be heard: the seconds before it and after it join.
+        """Return the history after an unusable hop; the hops before and after it become adjacent.
 
-        Those before are forgotten after three seconds without sound.
+        After three seconds without usable hops the recent evidence is deleted.
         """
         missed = self.missed + 1
         recent = self.recent if missed < inputs.RECENT_HOPS else self.recent[:0]
         return SequenceHistory(recent, self.minute, missed)
 
     def heard(self, columns: FloatArray) -> "SequenceHistory":
-        """Return the history one hop on, of `hop_columns` of one row."""
+        """Return the history after one more hop, given by its row of `hop_columns`."""
         recent = np.concatenate([self.recent[1 - inputs.MEMORY_HOPS :], columns])
         minute = np.concatenate([self.minute[1 - inputs.QUIET_HOPS :], inputs.streets_own(columns)])
         return SequenceHistory(recent, minute)
@@ -66,7 +66,7 @@ class SequenceHistory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceReading:
-    """What the last seconds said of both sides, at the share of hazards that the model was trained at.
+    """Posterior of both sides from the last seconds, at the share of hazards in the model's training.
 
     Examples
     --------
@@ -76,13 +76,13 @@ class SequenceReading:
     """
 
     groups: FloatArray  # shape (2, groups): Posterior of the left and the right side
-    share: FloatArray  # shape (groups,): The prior in it
+    share: FloatArray  # shape (groups,): Its prior
     margin_s: float = 0.0
     alarm: SequenceAlarm | None = None
 
     def __post_init__(self) -> None:
         freeze_arrays(self, groups=(len(inputs.SIDES), len(GROUPS)), share=(len(GROUPS),))
-        # As `numpy.allclose`, whose fifty calls take as long as a third of the trees.
+        # `numpy.allclose` makes fifty calls, which take a third of the time of the trees.
         off = np.abs(np.add.reduce(self.groups, 1) - 1.0)
         if np.minimum.reduce(self.groups, None) < 0.0 or np.maximum.reduce(off) > _ROUNDING:
             raise InvalidArgumentError("groups: expected probabilities that sum to one on each side")
@@ -91,7 +91,7 @@ class SequenceReading:
 
 
 class SequenceReader:
-    """Reads a stream hop by hop, what `SequenceModel.posterior` reads of the whole.
+    """Compute hop by hop the posterior that `SequenceModel.posterior` computes for a whole stream.
 
     Examples
     --------
@@ -111,23 +111,23 @@ class SequenceReader:
         street: StreetListener | None = None,
     ) -> None:
         self._model = model
-        self.street = street  # Where sides are learned
-        self.history = history or SequenceHistory()  # All that is carried; `Checkpoint` writes it to disk
+        self.street = street  # Learns the sides of a street
+        self.history = history or SequenceHistory()  # The whole state; `Checkpoint` writes it to disk
 
     def miss(self, hops: int = 1) -> None:
-        """Pass hops that could not be heard; nothing is learned from them."""
-        # Ten simulated demos, one second lost: the probability that a vehicle comes is off by .04 in the
-        # first half second that is heard again and by .02 in the next. With the last hop heard in place of
-        # each lost one it was .08 and .03, with nothing kept there was no reading for a second.
+        """Skip unusable hops without learning from them."""
+        # In ten simulated demos with one second lost, the probability of an approaching vehicle is off by
+        # 0.04 in the first usable half second and by 0.02 in the next. With each lost hop replaced by the
+        # last usable one the errors were 0.08 and 0.03; without a history there was no result for a second.
         for _ in range(min(hops, inputs.RECENT_HOPS)):
             self.history = self.history.missed_hop()
         if self.street is not None and not self.history.hops:
             self.street.interrupt()
 
     def read(self, columns: FloatArray, feature: FloatArray | None = None) -> SequenceReading | NotUsable:
-        """Take the next hop in; return what it says together with those before.
+        """Add the next hop and return the posterior of the last seconds.
 
-        `feature` is that of its window, shape (azimuths,), by which the street tells the sides.
+        `feature`, shape (azimuths,), is that of the hop's window; the street's patterns apply to it.
         """
         self.history = history = self.history.heard(columns)
         if history.hops < LEAST_HOPS:

@@ -1,13 +1,13 @@
-r"""From which arm of a known street a vehicle comes, by the directions in which the sound arrives.
+r"""The arm of a known street from which a vehicle comes, from the directions in which the sound arrives.
 
-Walls throw the sound of one arm to the other side, or they do not: a pattern that means left at one
-junction means right at the next. Where passes have told what either arm sounds like, the pattern x of a
-window leans to one of them by a linear discriminant,
+Walls may reflect the sound of one arm to the other side, so a pattern that means left at one junction can
+mean right at the next. After some passes, the patterns of both arms are known. A linear discriminant then
+classifies the pattern x of a window,
 
 .. math:: s = g\, c \tanh\!\Big( \frac{w^\top x + b}{c} \Big)
 
-with g the certainty that few passes leave. Of the vehicles that come, the share on either side moves by s in
-log-odds; the probability that one comes does not change.
+where the certainty g is small after few passes. The log-odds of left against right change by s; the
+probability that a vehicle comes does not change.
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,15 +21,15 @@ from worldstate.ground.checks import freeze_arrays
 from .sequence_inputs import RECENT_HOPS, SIDES
 from .sequence_model import COMING_S, GROUPS
 
-# Neighbouring azimuths of the spatial spectrum together, 15 degrees of half a circle.
+# Groups of neighbouring azimuths in the spatial spectrum, 15 degrees each over a half circle.
 SECTORS = 12
-# The sequence has read the same sound, and windows overlap: none counts for more.
+# Largest contribution of a window: the sequence model uses the same sound, and windows overlap.
 _MOST_NATS = 3.0
 _COMING, _OTHER = len(COMING_S), GROUPS.index("other")
 
 
 def arrival_pattern(feature: FloatArray) -> FloatArray:
-    """Return how the level lies over `SECTORS` sectors, nats above its mean; shape (n, 12) of (n, azimuths).
+    """Return the level of each sector minus the mean level, nats, shape (n, 12) from (n, azimuths).
 
     Examples
     --------
@@ -43,13 +43,13 @@ def arrival_pattern(feature: FloatArray) -> FloatArray:
 
 
 def coming_probability(groups: FloatArray) -> FloatArray:
-    """Return the probability that a vehicle comes, shape (...,) of posteriors (..., 2, groups)."""
+    """Return the probability that a vehicle comes, shape (...,) from posteriors (..., 2, groups)."""
     return np.asarray(mean(np.add.reduce(groups[..., :_COMING], -1) + groups[..., _OTHER], -1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreetSides:
-    """Which pattern means which arm at one place, heard by one array.
+    """A linear discriminant between the patterns of both arms, for one place and one array.
 
     Examples
     --------
@@ -61,15 +61,15 @@ class StreetSides:
 
     weights: FloatArray  # shape (12,): Per nat of a sector
     offset: float
-    certainty: float  # In [0, 1]: of few passes, less
+    certainty: float  # In [0, 1]; smaller after few passes
 
     def log_ratio(self, feature: FloatArray) -> FloatArray:
-        """Return the log-odds of left against right by the windows' own patterns, shape (n,)."""
+        """Return the log-odds of left against right from the windows' patterns, shape (n,)."""
         leaning = arrival_pattern(feature) @ self.weights + self.offset
         return np.asarray(self.certainty * _MOST_NATS * np.tanh(leaning / _MOST_NATS))
 
     def turned(self, groups: FloatArray, feature: FloatArray) -> FloatArray:
-        """Return posteriors of the groups, vehicles that come moved to the side of the street's pattern.
+        """Return the posteriors after the log-odds of the sides are changed by the street's pattern.
 
         Shapes: groups (n, 2, groups), feature (n, azimuths), positive.
         """
@@ -84,8 +84,8 @@ class StreetSides:
         return found
 
 
-# Of 0, .3, .5 and 1 for the doubt, ten passes of exam seeds 1 and 2 took the side from right in .838 of the
-# hops to .859, .878, .876 and .877 (version 0.2).
+# With a doubt of 0, 0.3, 0.5 and 1, ten passes of exam seeds 1 and 2 increased the share of hops with the
+# right side from 0.838 to 0.859, 0.878, 0.876 and 0.877 (version 0.2).
 _DRAWN_TOGETHER, _DOUBT = 0.5, 0.5
 _ROUND = 0.1
 _EMPTY = (0.0,) * SECTORS
@@ -93,26 +93,25 @@ _EMPTY = (0.0,) * SECTORS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassSound:
-    """How the sound of one pass arrived while the vehicle was hidden."""
+    """Patterns of the sound of one pass while the vehicle was hidden."""
 
     patterns: FloatArray  # shape (n, 12)
-    weights: FloatArray  # shape (n,): Probability that a vehicle was heard to come
-    heard_by: str  # Array and feature that the patterns were heard with
+    weights: FloatArray  # shape (n,): Probability that a vehicle comes, from its sound
+    heard_by: str  # Array and feature of the patterns
 
 
 @dataclass(frozen=True, slots=True)
 class SidePatterns:
-    r"""Weights, sums and squares of patterns of both arms; left before right.
+    r"""Weights, sums and squares of the patterns of both arms, left before right.
 
-    Patterns x of the three seconds before T0, weighed by the probability a that one was heard to come. Every
-    pass counts by its mean weight; means are drawn together as by half a pass that was heard on either side,
+    The patterns x are those of the three seconds before T0, weighted by the probability a that a vehicle
+    comes. Every pass contributes its mean weight. The means are shrunk towards each other by half a pass,
 
     .. math:: m_g = \frac{\sum_g a x + \tfrac{1}{2} \bar m}{n_g + \tfrac{1}{2}}, \qquad
               w = S^{-1} (m_{left} - m_{right}), \qquad b = -\tfrac{1}{2} w^\top (m_{left} + m_{right})
 
-    with S the scatter about these means, a tenth of it taken for the same in all directions. What is known to
-    be of one arm in n passes counts with the certainty :math:`(1 + \tfrac{1}{2} (1/n_{left} +
-    1/n_{right}))^{-1}`.
+    where S is the scatter about these means; a tenth of it is replaced by an isotropic scatter. The certainty
+    after n passes of an arm is :math:`(1 + \tfrac{1}{2} (1/n_{left} + 1/n_{right}))^{-1}`.
 
     Examples
     --------
@@ -135,7 +134,7 @@ class SidePatterns:
             raise InvalidArgumentError(f"patterns: expected {SECTORS} sectors in every row")
 
     def with_pass(self, arm: str, sound: PassSound) -> "SidePatterns":
-        """Return them after one more pass; what another array heard before it is forgotten."""
+        """Return the patterns after one more pass; patterns of another array are deleted before it."""
         known = self if self.heard_by == sound.heard_by else SidePatterns(sound.heard_by)
         own = int(arm == "right")
         weighed = sound.weights[:, None] * sound.patterns / len(sound.weights)
@@ -145,7 +144,7 @@ class SidePatterns:
         return known._of(weights, sums, np.array(known.squares) + weighed.T @ sound.patterns)
 
     def faded(self, factor: float) -> "SidePatterns":
-        """Return them with everything weighed less."""
+        """Return the patterns with all weights multiplied by a factor."""
         return self._of(*(factor * np.array(one) for one in (self.weights, self.sums, self.squares)))
 
     def _of(self, weights: FloatArray, sums: FloatArray, squares: FloatArray) -> "SidePatterns":
@@ -154,14 +153,14 @@ class SidePatterns:
         return replace(self, weights=(left, right), sums=(tuple(of_left), tuple(of_right)), squares=rows)
 
     def sides(self) -> StreetSides | None:
-        """Return what they say of windows, None as long as one arm was hardly heard."""
+        """Return the discriminant of windows; None if an arm has hardly any passes."""
         weights, sums = np.array(self.weights), np.array(self.sums)
-        # Below, both means are the same within rounding.
+        # With smaller weights both means are equal within rounding.
         if weights.min() < _ROUND:
             return None
         usual = (sums / weights[:, None]).mean(axis=0)
         means = (sums + _DRAWN_TOGETHER * usual) / (weights + _DRAWN_TOGETHER)[:, None]
-        # Of sums about means that are not quite their own.
+        # The general formula, because the shrunk means are not the exact means.
         crossed = sums.T @ means
         about = np.array(self.squares) - crossed - crossed.T + (means.T * weights) @ means
         scatter = about / weights.sum()
@@ -172,13 +171,13 @@ class SidePatterns:
         return StreetSides(direction, float(offset), float(certainty))
 
 
-# A vehicle that comes is heard for some three seconds; with one in the other arm the sound has no known side.
+# A coming vehicle is audible for about three seconds; with one in each arm the side of the sound is unknown.
 HEARD_HOPS = RECENT_HOPS - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreetHearing:
-    """What is known of the arms' sound, and that of the last three seconds, whose arm is not known yet.
+    """Patterns of both arms, and the last three seconds, whose arm is not yet known.
 
     Examples
     --------
@@ -187,7 +186,7 @@ class StreetHearing:
     """
 
     known: SidePatterns
-    # shape (up to 30, 13): Pattern and probability that a vehicle comes; the last hop last
+    # Shape (up to 30, 13): pattern and probability that a vehicle comes; the last hop is last
     recent: FloatArray = field(default_factory=partial(np.zeros, (0, SECTORS + 1)))
     since: tuple[int, int] = (HEARD_HOPS, HEARD_HOPS)  # Hops since a vehicle came out of either arm
 
@@ -199,7 +198,7 @@ class StreetHearing:
 
 
 class StreetListener:
-    """Moves vehicles to the side of the street's patterns, hop by hop, and learns these from each that comes.
+    """Corrects the side of coming vehicles hop by hop and learns the street's patterns from each pass.
 
     Examples
     --------
@@ -214,11 +213,11 @@ class StreetListener:
     """
 
     def __init__(self, hearing: StreetHearing) -> None:
-        self.hearing = hearing  # All that is carried; `Checkpoint` writes it to disk
+        self.hearing = hearing  # The whole state; `Checkpoint` writes it to disk
         self._sides: StreetSides | None = hearing.known.sides()
 
     def turned(self, groups: FloatArray, feature: FloatArray) -> FloatArray:
-        """Take the next hop in; return its posteriors with the sides that are known so far.
+        """Add the next hop and return its posteriors after the correction of the sides.
 
         Shapes: groups (2, groups), feature (azimuths,), positive.
         """
@@ -227,17 +226,17 @@ class StreetListener:
         left, right = [min(one + 1, HEARD_HOPS) for one in before.since]
         recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now])
         self.hearing = StreetHearing(before.known, recent, (left, right))
-        # So long after a vehicle came into view its sound, from wherever it is now, is of no arm.
+        # The sound of a vehicle that has come into view belongs to no arm for this time.
         if self._sides is None or min(left, right) < HEARD_HOPS:
             return groups
         return np.asarray(self._sides.turned(groups[None], feature[None])[0])
 
     def interrupt(self) -> None:
-        """Forget the last seconds; what is known of the street stays."""
+        """Delete the last seconds; the patterns of the street remain."""
         self.hearing = StreetHearing(self.hearing.known, since=self.hearing.since)
 
     def passed(self, arm: str) -> None:
-        """Learn from a vehicle that came into view out of an arm just now."""
+        """Learn from a vehicle that has just come into view out of an arm."""
         known, recent, since = self.hearing.known, self.hearing.recent, self.hearing.since
         own = SIDES.index(arm)
         if since[1 - own] >= HEARD_HOPS and len(recent):

@@ -1,13 +1,13 @@
-r"""Signature model for junctions never seen: linear experts on a window compared with its site.
+r"""Signature model for unknown junctions: linear experts on the difference between a window and its site.
 
-Every expert is given one view of the window and returns log-posteriors; the ensemble is their mean
-over experts and over the window and its mirror image, sides exchanged:
+Every expert receives one view of the window and returns log-posteriors. The ensemble is their mean over
+experts and over the window and its mirror image, in which the sides are exchanged:
 
 .. math:: \log P(c \mid x) \propto \tfrac{1}{2 E} \sum_e \big[ \ell_e(c, x) + \ell_e(\bar c, \bar x) \big],
           \qquad \ell_e = \log \mathrm{softmax}\, \big( W_e (v_e(x) - \mu_e) / \sigma_e + b_e \big),
 
-so that mirroring the world exchanges left and right to the bit. Both and direct, where a model knows them,
-are their own mirror images: see `window_classes`.
+so that a mirrored scene exchanges left and right bit for bit. The optional classes both and direct are their
+own mirror images: see `window_classes`.
 """
 
 import math
@@ -33,7 +33,7 @@ KINDS = ("mean", "median", "quiet")
 
 
 def log_levels(X: ArrayLike) -> FloatArray:
-    r"""Return the natural logarithm of levels, silence held at 1e-4.
+    r"""Return the natural logarithm of levels, which are limited to at least 1e-4.
 
     .. math:: x = \ln \max(X, 10^{-4})
 
@@ -46,13 +46,13 @@ def log_levels(X: ArrayLike) -> FloatArray:
 
 
 def site_reference(levels: ArrayLike) -> FloatArray:
-    r"""Return three unlabelled summaries of a site from its windows, one after the other: its reference.
+    r"""Return the reference of a site: three unlabelled summaries of its windows, concatenated.
 
     .. math:: r = \big(\langle x \rangle,\; \mathrm{median}\, x,\;
               \langle x \mid \max_a x_a \le q_{0.35} \rangle\big)
 
-    The last is the mean over the 35 % of the windows whose loudest feature is the least: close to what the
-    site is like while no vehicle comes, whatever share of the windows that is.
+    The last summary is the mean over the 35 % of the windows with the lowest loudest feature. It approximates
+    the site without vehicles, whatever the share of such windows is.
 
     Shapes: levels (windows, features), natural logarithms; returns (3 * features,).
 
@@ -83,20 +83,20 @@ def mirror_features(X: FloatArray, segments: int = SEGMENTS) -> FloatArray:
 
 
 _SHARPNESS = 4.0
-_PARTS = 3  # Of the directions of a segment: left, centre and right
+_PARTS = 3  # Parts of a segment's directions: left, centre and right
 
 
 def shape_features(levels: FloatArray) -> FloatArray:
-    r"""Return peaks, sides, widths and changes of log-levels over directions, shape (n, 13 * segments + 5).
+    r"""Return peaks, sides, widths and changes of log-levels over direction, shape (n, 13 * segments + 5).
 
     .. math:: p = \sum_a w_a u_a, \qquad \sigma^2 = \sum_a w_a u_a^2 - p^2, \qquad
               w_a \propto e^{4 (x_a - \max x)}, \quad \sum_a w_a = 1
 
-    are side and width, u running from -1 to 1; the others are extremes, means, deviations and differences.
+    are side and width, with u from -1 to 1; the others are extremes, means, deviations and differences.
 
     Shapes: levels (n, segments * directions).
     """
-    # Mirroring the directions exchanges the sides and changes the sign of what points to one.
+    # Mirroring the directions exchanges left and right values and changes the sign of signed ones.
     stretches = levels.reshape(len(levels), SEGMENTS, -1)
     first, last = stretches[:, 0], stretches[:, -1]
     change, highest = last - first, np.maximum.reduce
@@ -113,7 +113,7 @@ def _std(values: FloatArray) -> FloatArray:
 
 
 def _columns(levels: FloatArray) -> list[FloatArray]:
-    """Numbers of each stretch, every one of shape (n, segments)."""
+    """Return the values of each segment, each of shape (n, segments)."""
     n_directions = levels.shape[2]
     highest, total = np.maximum.reduce, np.add.reduce
     peak, middle = highest(levels, 2), median(levels)
@@ -123,7 +123,7 @@ def _columns(levels: FloatArray) -> list[FloatArray]:
     direction = _directions(n_directions)
     weights = np.exp(_SHARPNESS * (levels - peak[..., None]))
     weights /= total(weights, 2)[..., None]
-    # Sums, not products of matrices: a row then comes out to the bit the same among whatever others.
+    # Sums instead of matrix products: the result of a row then does not depend on the other rows.
     position, square = total(weights * direction, 2), total(weights * direction**2, 2)
     width = np.sqrt(np.maximum(square - position**2, 0.0))
     heights = [peak, middle, np.minimum.reduce(levels, 2), peak - middle]
@@ -150,13 +150,13 @@ class Expert:
     'mean'
     """
 
-    # `mean`, `median` or `quiet`: log-levels above that summary of the site; `shape`: a few numbers
-    # of the window alone; `shape_change`: how they differ from those of the site's median.
+    # `mean`, `median` or `quiet`: log-levels minus that summary of the site; `shape`: the values of
+    # `shape_features` for the window; `shape_change`: their difference to those of the site's median.
     view: str
     mean: FloatArray  # shape (inputs,): Standardisation; scale > 0
     scale: FloatArray
-    weights: FloatArray  # shape (classes, inputs): One row for each class of the model
-    intercepts: FloatArray  # shape (classes,): Added to the weighted sums
+    weights: FloatArray  # shape (classes, inputs)
+    intercepts: FloatArray  # shape (classes,)
 
     def __post_init__(self) -> None:
         one_of("view", self.view, VIEWS)
@@ -166,7 +166,7 @@ class Expert:
             raise InvalidArgumentError("scale: expected positive numbers")
 
     def sums(self, seen: FloatArray) -> FloatArray:
-        r"""Return what the softmax is taken of, shape (n, classes), from its view, shape (n, inputs).
+        r"""Return the inputs of the softmax, shape (n, classes), from the view, shape (n, inputs).
 
         .. math:: a = W (v - \mu) / \sigma + b
 
@@ -181,21 +181,21 @@ def expert_views(levels: FloatArray, reference: FloatArray) -> dict[str, FloatAr
     .. math:: v = x - r \text{ (mean, median, quiet)}, \qquad v = \phi(x) \text{ (shape)}, \qquad
               v = \phi(x) - \phi(r_{median}) \text{ (change)}
 
-    with phi by `shape_features`.
+    where phi is `shape_features`.
 
     Shapes: levels (n, features), reference (n, 3 * features).
     """
     n = levels.shape[1]
     summaries = {kind: reference[:, n * k : n * (k + 1)] for k, kind in enumerate(KINDS)}
     views = {kind: levels - summary for kind, summary in summaries.items()}
-    # One call for both: of a single window most of it is what calls cost.
+    # One call for both, because for a single window the overhead of calls dominates.
     shapes = shape_features(np.concatenate([levels, summaries["median"]]))
     views[SHAPE], of_site = shapes[: len(levels)], shapes[len(levels) :]
     return views | {SHAPE_CHANGE: views[SHAPE] - of_site}
 
 
 def log_softmax(sums: FloatArray) -> FloatArray:
-    r"""Return the rows less the log of their summed exponentials.
+    r"""Return the log softmax of each row.
 
     .. math:: \ell_c = a_c - \log \sum_{c'} e^{a_{c'}}
 
@@ -206,7 +206,7 @@ def log_softmax(sums: FloatArray) -> FloatArray:
 
 
 def total(values: FloatArray) -> FloatArray:
-    r"""Return the sums of rows, shape (n, 1), bit-identical under any order of the columns.
+    r"""Return the sums of rows, shape (n, 1), bit-identical for any order of the columns.
 
     .. math:: s_i = \sum_j x_{ij}
 
@@ -223,7 +223,7 @@ def total(values: FloatArray) -> FloatArray:
 
 
 def split_reference(X: FloatArray) -> tuple[FloatArray, FloatArray]:
-    r"""Part windows with a reference behind them into log-levels and references.
+    r"""Split windows with appended references into log-levels and references.
 
     .. math:: x = \ln \max(X, 10^{-4})
 
@@ -239,37 +239,36 @@ def split_reference(X: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 MOST_EXPERTS = 32
-# Where the training sites do not say.
+# Used if the training sites do not determine it.
 PRIOR_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EnsembleModel:
-    """Coefficients of the ensemble, no rows of the data it was trained on.
+    """Coefficients of the ensemble; it holds no training data.
 
     Parameters
     ----------
     experts : tuple of Expert
-        At least one.
+        At least one expert.
     class_prior : ndarray, shape (classes,)
-        Class frequencies of the training set, mirrored rows included.
+        Class frequencies of the training set, including mirrored rows.
     home : ndarray, shape (3 * features,)
-        Mean reference of the training sites, mirrored ones included: stands in where no site is known.
+        Mean reference of the training sites, including mirrored ones; used for an unknown site.
     empty : ndarray, shape (features,)
-        Mean log-levels of the training windows without any source: what a stream that is mostly empty is
-        compared with, see `SiteEstimate`.
+        Mean log-levels of the training windows without a source. A mostly empty stream is compared with it,
+        see `SiteEstimate`.
     domain : ModelDomain, optional
-        What it was made for; `AcousticAdapter` refuses another array, rate or feature.
+        Conditions of the training data; `AcousticAdapter` rejects another array, rate or feature.
     prior_s : float
-        Seconds of listening that weigh as much as the training sites: see `SiteEstimate`.
+        Duration of a stream after which it has the same weight as the training sites: see `SiteEstimate`.
     classes : tuple of str
-        Of a window, the columns of `predict_proba`: front, left, none, right, then both and direct where the
-        model knows them.
+        Columns of `predict_proba`: front, left, none, right, then both and direct if the model has them.
 
     Raises
     ------
     InvalidArgumentError
-        If the experts do not fit the reference or the classes, or the prior is none.
+        If the experts do not fit the reference or the classes, or the prior is invalid.
 
     Examples
     --------
@@ -329,7 +328,7 @@ class EnsembleModel:
         Parameters
         ----------
         X : array_like, shape (n, features) or (n, 4 * features)
-            Windows, or windows each with the `row` of its site's reference behind it.
+            Windows, optionally each followed by the reference of its site.
 
         Raises
         ------
@@ -348,7 +347,7 @@ class EnsembleModel:
         return self.posteriors(*split_reference(inputs))
 
     def posteriors(self, levels: FloatArray, reference: FloatArray) -> FloatArray:
-        """Return what `predict_proba` does for log-levels, shape (n, features), and references."""
+        """Return the result of `predict_proba` for log-levels, shape (n, features), and references."""
         n = len(levels)
         views = expert_views(
             np.concatenate([levels, mirror_features(levels, SEGMENTS)]),
@@ -356,29 +355,29 @@ class EnsembleModel:
         )
         told = [(expert, views[expert.view]) for expert in self.experts]
         sums = [expert.sums(half) for expert, seen in told for half in (seen[:n], seen[n:])]
-        # One call for all experts: of a single window most of it is what calls cost.
+        # One call for all experts, because for a single window the overhead of calls dominates.
         both = log_softmax(np.concatenate(sums)).reshape(len(told), 2, n, -1)
-        # Added to each other first: the sum of two does not depend on which is the mirror image.
+        # These two are added first, because then the result is the same for the mirror image.
         pairs = both[:, 0] + both[:, 1][..., window_classes.mirrored_classes(len(self.classes))]
         pooled = log_softmax(np.add.reduce(pairs) / (2 * len(told)))
         shares = np.maximum(np.exp(pooled), window_classes.SMALLEST_PROBABILITY)
         return np.asarray(shares / total(shares))
 
     def explain(self, X: ArrayLike) -> FloatArray:
-        r"""Return the posteriors of front, left, none and right alone, shape (n, 4).
+        r"""Return the posteriors of front, left, none and right only, shape (n, 4).
 
         .. math:: P'_k = P_k + \tfrac{1}{2} P_{both} [k \text{ a side}] + P_{direct}\, \pi'_k / \sum \pi'
 
-        Errors are those of `predict_proba`.
+        It raises the errors of `predict_proba`.
 
         Parameters
         ----------
         X : array_like, shape (n, features) or (n, 4 * features)
-            As for `predict_proba`.
+            See `predict_proba`.
 
         References
         ----------
-        Derived here: see the head of `worldstate.abduction.signature.window_classes`.
+        Derived here: see the module `worldstate.abduction.signature.window_classes`.
         """
         return window_classes.explained(self.predict_proba(X), self.classes, self.class_prior)
 
@@ -390,7 +389,7 @@ class EnsembleModel:
         Parameters
         ----------
         feature : array_like, shape (features,) or (4 * features,)
-            One window, with its reference or without.
+            One window with or without its reference.
 
         Raises
         ------
@@ -409,5 +408,5 @@ AnySignature = SignatureModel | EnsembleModel
 
 
 def explain(signature: AnySignature, X: ArrayLike) -> FloatArray:
-    """Return the posteriors of front, left, none and right of windows, shape (n, 4), by either model."""
+    """Return the posteriors of front, left, none and right of windows, shape (n, 4), for both models."""
     return signature.explain(X) if isinstance(signature, EnsembleModel) else signature.predict_proba(X)

@@ -1,8 +1,8 @@
-r"""The published signature model: from a feature vector to likelihoods of the explanations.
+r"""The published signature model: likelihoods of the explanations from a feature vector.
 
-A linear one-against-one machine on standardised features; each pair's decision value goes through a sigmoid,
-and the pairs are coupled into posteriors of front, left, none and right. Dividing by the class frequencies of
-the training set leaves likelihoods, which is what eq. (6) takes.
+A linear one-against-one support vector machine classifies standardised features. The decision value of each
+pair of classes passes through a sigmoid, and the pairs are coupled into posteriors of front, left, none and
+right. Their ratios to the class frequencies of the training set are the likelihoods that eq. (6) needs.
 """
 
 from dataclasses import dataclass, field
@@ -25,29 +25,29 @@ EgoMotion = Literal["standing", "moving", "any"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelDomain:
-    """Of what the windows were made that a model was trained on, or that a table holds.
+    """Conditions under which the windows of a training set or a table were recorded.
 
     Parameters
     ----------
     array : str
         Name of the microphone array.
     positions_m : ndarray, shape (M, 3)
-        Its microphones in the order of the channels, `base_link` axes, metres.
+        Positions of the microphones in channel order, `base_link` axes, metres.
     sample_rate_hz : (float, float)
-        Lowest and highest rate with frames of 512; lower ones with frames shorter by as much count as these.
+        Lowest and highest rate for frames of 512; lower rates with proportionally shorter frames are allowed.
     band_hz : (float, float)
         Band of the feature.
     feature : str
         Name and version of the feature.
     ego_motion : {"standing", "moving", "any"}
-        What the ego vehicle did.
+        State of the ego vehicle.
     fastest_mps : float, optional
-        How fast it drove at most; None in files that do not state it.
+        Maximum speed; None in files without this value.
 
     Raises
     ------
     InvalidArgumentError
-        If the positions are no (M, 3) array of finite numbers or an interval is empty.
+        If the positions are not an (M, 3) array of finite numbers or an interval is empty.
 
     Examples
     --------
@@ -82,7 +82,7 @@ PAIRS = tuple(combinations(range(len(CLASSES)), 2))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignatureModel:
-    r"""Coefficients of the published classifier, no rows of the data it was trained on.
+    r"""Coefficients of the published classifier; it holds no training data.
 
     .. math:: f_{ij}(x) = w_{ij}^T (x - \mu) / \sigma + b_{ij}, \qquad
               P(i \mid i \text{ or } j, x) = 1 / (1 + \exp(A_{ij} f_{ij} + B_{ij})).
@@ -92,20 +92,20 @@ class SignatureModel:
     mean, scale : ndarray, shape (features,)
         Standardisation; scale > 0.
     coefficients : ndarray, shape (6, features)
-        w, one row for each pair of the classes front, left, none, right.
+        w, one row per pair of the classes front, left, none and right.
     intercepts : ndarray, shape (6,)
         b.
     slopes, offsets : ndarray, shape (6,)
         A and B of the sigmoids.
     class_prior : ndarray, shape (4,)
-        Class frequencies of the training set, mirrored rows included.
+        Class frequencies of the training set, including mirrored rows.
     domain : ModelDomain, optional
-        What it was made for; `AcousticAdapter` refuses another array, rate or feature.
+        Conditions of the training data; `AcousticAdapter` rejects another array, rate or feature.
 
     Raises
     ------
     InvalidArgumentError
-        If shapes do not agree, a number is not finite, a scale is not positive or the prior is none.
+        If shapes differ, a number is not finite, a scale is not positive or the prior is invalid.
 
     References
     ----------
@@ -155,7 +155,7 @@ class SignatureModel:
         return tuple(self.class_prior[list(EXPLANATION_COLUMNS)].tolist())
 
     def decision_values(self, X: ArrayLike) -> FloatArray:
-        r"""Return f, shape (n, 6): positive where the first class of the pair is the better one.
+        r"""Return f, shape (n, 6), which is positive if the first class of the pair is more likely.
 
         .. math:: f_{ij}(x) = w_{ij}^T (x - \mu) / \sigma + b_{ij}
 
@@ -182,16 +182,16 @@ class SignatureModel:
         .. math:: r_{ij} = 1 / (1 + \exp(A_{ij} f_{ij} + B_{ij})), \qquad
                   \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2
 
-        Errors are those of `decision_values`.
+        It raises the errors of `decision_values`.
 
         Parameters
         ----------
         X : array_like, shape (n, features)
-            One row a window.
+            One row per window.
 
         References
         ----------
-        J. Platt 1999 (sigmoids), T.-F. Wu, C.-J. Lin and R. C. Weng 2004 (coupling): see `platt` and
+        J. Platt 1999 (sigmoids), see `fit_platt`; T.-F. Wu, C.-J. Lin and R. C. Weng 2004 (coupling), see
         `couple`.
         """
         return couple(sigmoid(self.decision_values(X), self.slopes, self.offsets), len(CLASSES))
@@ -219,13 +219,13 @@ class SignatureModel:
 
 
 def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
-    r"""Return class probabilities from probabilities of pairs, shape (n, classes), positive, of sum one.
+    r"""Return positive class probabilities with sum one from pair probabilities, shape (n, classes).
 
     For classes i and j let :math:`r_{ij}` estimate :math:`P(i \mid i \text{ or } j)`. The probabilities are
 
     .. math:: \hat p = \arg\min_p \sum_i \sum_{j \ne i} (r_{ji} p_i - r_{ij} p_j)^2, \qquad \sum_i p_i = 1
 
-    whose optimality conditions are linear and whose solution is never negative.
+    The optimality conditions are linear and the solution is never negative.
 
     Shapes: pairwise (n, pairs), in the order of `PAIRS`.
 
@@ -236,7 +236,7 @@ def couple(pairwise: FloatArray, n_classes: int) -> FloatArray:
     r = np.zeros((len(pairwise), n_classes, n_classes))
     r[:, first, second] = np.clip(pairwise, SMALLEST_PROBABILITY, 1.0 - SMALLEST_PROBABILITY)
     r[:, second, first] = 1.0 - r[:, first, second]
-    # The quadratic form Q and the sum, bordered: [[Q, 1], [1', 0]].
+    # The quadratic form Q with the constraint on the sum: [[Q, 1], [1', 0]].
     matrix = np.ones((len(r), n_classes + 1, n_classes + 1))
     matrix[:, :-1, :-1] = (r**2).sum(axis=1)[:, None] * np.eye(n_classes) - r * r.mT
     matrix[:, -1, -1] = 0.0

@@ -1,20 +1,21 @@
-r"""The site's reference while running: a running mean with a forgetting time, nothing labelled.
+r"""Estimate of a site's reference during operation: an unlabelled running mean with a forgetting time.
 
-A stream is mostly empty street, the windows that a classifier was trained on are not: a mean over the stream
-stands lower than the training sites' references do, and would turn every window into a hazard. What the
-stream says of its site is therefore how its mean differs from the mean empty window of the training sites,
+A stream consists mostly of an empty street, but the training windows do not. The mean of a stream is
+therefore lower than the references of the training sites and would make every window look like a hazard.
+Instead, the estimate uses the difference between this mean and the mean empty window of the training sites,
 
 .. math:: d = \bar x - x_{empty}, \qquad
           r = r_{home} + w \big( \tfrac{1}{4} \langle d \rangle + d - \langle d \rangle \big),
 
-with the mean over directions taken apart from the pattern. A louder street raises the level of an approaching
-vehicle less than its own, since the louder one of the two is heard: a quarter of the level is carried over,
-all of the pattern. On streams from real windows, 95 % of them hazard-free, all of both cost a tenth of the
-hits at junctions new to a standing ego; a quarter of the level costs none, and is enough for a moving one.
+which separates the mean over directions, the level, from the pattern. An approaching vehicle is less audible
+in a louder street, so its level rises by less than the street's. Therefore, the reference receives a quarter
+of the level and all of the pattern. On streams from real windows, 95 % of them hazard-free, all of the level
+costs a tenth of the detections at unknown junctions with a standing ego. A quarter costs none and is
+sufficient for a moving ego.
 
-How much is heard before the stream counts more than the training sites, the model says: the scatter of
-empty windows at one site over that between sites. Sites that differ much are learned in a second (moving
-ego), those that differ little in four (standing).
+The model sets the duration after which the stream has more weight than the training sites: the variance of
+empty windows at one site divided by that between sites. It is one second for a moving ego, whose sites differ
+much, and four seconds for a standing one.
 """
 
 import math
@@ -32,7 +33,7 @@ from worldstate.ground.serialisation import Check
 from .ensemble import KINDS, EnsembleModel, log_levels
 from .window_classes import window_evidence
 
-# Share of the difference in level that is carried over; all of the pattern is.
+# Share of the difference in level that the reference receives; it receives all of the pattern.
 _LEVEL_GAIN = 0.25
 
 
@@ -64,14 +65,14 @@ class SiteEstimateSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteEstimate:
-    """Running mean of log-levels and how many seconds of listening it stands for.
+    """Running mean of log-levels and its effective duration.
 
     Parameters
     ----------
     level : ndarray, shape (features,)
-        Mean of the natural logarithm.
+        Mean of the natural logarithm of the levels.
     heard_s : float
-        Seconds, the forgotten ones left out: never above the forgetting time plus one hop.
+        Duration without the forgotten part, seconds; at most the forgetting time plus one hop.
 
     Examples
     --------
@@ -85,17 +86,17 @@ class SiteEstimate:
 
     @classmethod
     def start(cls, n_features: int) -> "SiteEstimate":
-        """Return the estimate before any window.
+        """Return the estimate before the first window.
 
         Parameters
         ----------
         n_features : int
-            Of a window.
+            Number of features of a window.
         """
         return cls(np.zeros(n_features))
 
     def updated(self, feature: ArrayLike, dt_s: float, settings: SiteEstimateSettings) -> "SiteEstimate":
-        r"""Return the estimate after one more window, `dt_s` seconds after the last.
+        r"""Return the estimate after a window that follows `dt_s` seconds after the last one.
 
         .. math:: h \leftarrow h\, e^{-\Delta t / \tau} + \Delta t, \qquad
                   m \leftarrow m + \frac{\Delta t}{h}\, (\ln X - m)
@@ -103,19 +104,18 @@ class SiteEstimate:
         Parameters
         ----------
         feature : array_like, shape (features,)
-            Levels, not logarithms; `SiteSignature` has checked them.
+            Levels, not logarithms; they are not checked here but in `SiteSignature`.
         dt_s : float
             Seconds, > 0.
         settings : SiteEstimateSettings
             Forgetting time.
-
         """
         levels = log_levels(feature)
         heard_s = self.heard_s * math.exp(-dt_s / settings.forgetting_s) + dt_s
         return SiteEstimate(self.level + dt_s / heard_s * (levels - self.level), heard_s)
 
     def reference(self, model: EnsembleModel) -> FloatArray:
-        r"""Return what windows are to be compared with; that of the training sites before anything was heard.
+        r"""Return the reference of the site; before the first window, that of the training sites.
 
         .. math:: r = r_{home} + \frac{h}{h + h_0} \big( \tfrac{1}{4} \langle d \rangle
                   + d - \langle d \rangle \big), \qquad d = m - x_{empty}
@@ -123,7 +123,7 @@ class SiteEstimate:
         Parameters
         ----------
         model : EnsembleModel
-            Whose training sites stand in before anything was heard.
+            The model with the training sites.
 
         Raises
         ------
@@ -132,13 +132,13 @@ class SiteEstimate:
 
         References
         ----------
-        Derived here: see the head of `worldstate.abduction.signature.site_estimate`; gains by experiment. The
+        Derived here: see the module `worldstate.abduction.signature.site_estimate`; gains by experiment. The
         weight is that of C. Morris, "Parametric empirical Bayes inference", J. Am. Stat. Assoc. 78, 1983.
         """
         return self.beside(model.home, model.empty, model.prior_s)
 
     def beside(self, home: FloatArray, empty: FloatArray, prior_s: float) -> FloatArray:
-        """Return the reference beside training sites, before there is a model of them: as `reference`.
+        """Return the result of `reference` for training sites that have no model yet.
 
         Shapes: home (3 * features,), empty (features,).
         """
@@ -154,28 +154,28 @@ class SiteEstimate:
 
 
 class SiteSignature:
-    """Compares each window with what the site was like before it; takes the place of its model.
+    """Signature model that compares each window with the previous ones of its site.
 
     Parameters
     ----------
     model : EnsembleModel
-        The one that is asked.
+        Model that classifies the windows.
     settings : SiteEstimateSettings, optional
         Forgetting time.
     estimate : SiteEstimate, optional
-        From a checkpoint; a fresh one unless given.
+        Estimate from a checkpoint; a new one by default.
 
     Raises
     ------
     InvalidArgumentError
-        If the estimate is of another number of features.
+        If the estimate has another number of features.
 
     Attributes
     ----------
     estimate : SiteEstimate
-        All that is carried from window to window; `Checkpoint` writes it to disk.
+        The whole state; `Checkpoint` writes it to disk.
     domain, reference_prior
-        Those of the model.
+        Attributes of the model.
 
     Examples
     --------
@@ -205,7 +205,7 @@ class SiteSignature:
         Raises
         ------
         InvalidArgumentError
-            On another shape, NaN or infinity; nothing is learned then.
+            On another shape, NaN or infinity; the estimate then remains unchanged.
         """
         window = finite_array("feature", feature, (self._model.n_features,))
         reference = self.estimate.reference(self._model)

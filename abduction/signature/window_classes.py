@@ -1,12 +1,12 @@
-r"""Classes of a window, and evidence for the explanations from their posteriors, whatever classifier.
+r"""Classes of a window, and the evidence for the explanations from their posteriors, for any classifier.
 
-A window may hold a hidden vehicle on *both* sides, or a *direct* sound: one plane wave, from a source in the
-open. The first belongs to either side by a half, the second is as likely under every explanation,
+A window may contain a hidden vehicle on *both* sides or a *direct* sound: one plane wave from a source in the
+open. Half of the first is assigned to each side; the second is equally likely under every explanation,
 
 .. math:: P'_{left} = P_{left} + \tfrac{1}{2} P_{both} + P_{direct}\, \frac{\pi'_{left}}{\sum_k \pi'_k},
           \qquad \pi'_{left} = \pi_{left} + \tfrac{1}{2} \pi_{both},
 
-so that a direct sound moves no explanation against another: its side is that of its bearing.
+so that a direct sound does not change the likelihood ratios; its bearing gives its side.
 """
 
 from functools import lru_cache
@@ -23,7 +23,7 @@ FRONT, LEFT, NONE, RIGHT = range(len(CLASSES))
 # Columns of the posteriors in the order of the explanations: hidden left, hidden right, visible, none.
 EXPLANATION_COLUMNS = (LEFT, RIGHT, FRONT, NONE)
 
-# As in libsvm: no pair is ever certain, and so no log-likelihood is ever infinite.
+# As in libsvm: no probability is 0 or 1, so no log-likelihood is infinite.
 SMALLEST_PROBABILITY = 1e-7
 
 BOTH, DIRECT = "both", "direct"
@@ -33,7 +33,7 @@ _IS_SIDE = np.isin(range(len(CLASSES)), (LEFT, RIGHT)).astype(float)
 
 
 def hazard_statistic(probabilities: ArrayLike, miss_rate: float = 1.0) -> FloatArray:
-    r"""Return eq. (6) at the training prior for many windows at once, shape (n,).
+    r"""Return the hidden posterior, eq. (6), at the training prior for many windows, shape (n,).
 
     .. math:: s = \frac{P_l + P_r}{P_l + P_r + \beta\, P_{front} + P_{none}}
 
@@ -68,7 +68,7 @@ def evidence_of(
 
 
 def checked_classes(classes: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the classes of a model: the four of the data, then those of the others that it knows."""
+    """Return the classes of a model after a check: the four basic ones, then both and direct if present."""
     more = tuple(name for name in WINDOW_CLASSES[len(CLASSES) :] if name in classes)
     if classes != CLASSES + more:
         raise InvalidArgumentError(f"classes: expected {CLASSES} and then both, direct, got {classes!r:.80}")
@@ -76,12 +76,12 @@ def checked_classes(classes: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def mirrored_classes(n_classes: int) -> list[int]:
-    """Return the column of each class in the mirrored world: all but left and right are their own image."""
+    """Return the column of each class in the mirrored scene: only left and right are exchanged."""
     return [_MIRRORED.get(column, column) for column in range(n_classes)]
 
 
 def explained(shares: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> FloatArray:
-    r"""Return posteriors, or the prior itself, as those of front, left, none and right, shape (n, 4).
+    r"""Return posteriors (or the prior) of all classes as those of front, left, none and right, shape (n, 4).
 
     .. math:: P'_k = P_k + \tfrac{1}{2} P_{both} [k \text{ a side}] + P_{direct}\, \pi'_k / \sum \pi'
 
@@ -100,12 +100,12 @@ def explained(shares: FloatArray, classes: tuple[str, ...], prior: FloatArray) -
 
 
 def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> FloatArray:
-    r"""Return what a window says of a hidden vehicle on the left and on the right, shape (n, 2), nats.
+    r"""Return the log ratios of a hidden vehicle on the left and on the right, shape (n, 2), nats.
 
     .. math:: \lambda_k = \log \frac{P_k + P_{both}}{\pi_k + \pi_{both}}
               - \log \Big( \frac{P_{front}}{\pi_{front}} + \frac{P_{none}}{\pi_{none}} \Big)
 
-    with a direct sound as likely under each: sides do not exclude each other, and share nothing.
+    A direct sound is equally likely under each. The sides do not exclude each other.
 
     Shapes: posteriors (n, classes), prior (classes,).
 
@@ -124,7 +124,7 @@ def side_ratios(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatAr
 
 
 def visible_ratios(posteriors: FloatArray, prior: FloatArray) -> FloatArray:
-    r"""Return what a window says of a vehicle in view against none, shape (n,), nats.
+    r"""Return the log ratio of a visible vehicle to none, shape (n,), nats.
 
     .. math:: \log \frac{P_{front}}{\pi_{front}} - \log \frac{P_{none}}{\pi_{none}}
 
@@ -140,7 +140,7 @@ def visible_ratios(posteriors: FloatArray, prior: FloatArray) -> FloatArray:
 
 
 def window_evidence(posteriors: FloatArray, classes: tuple[str, ...], prior: FloatArray) -> SignatureEvidence:
-    """Return what one window says, from its posteriors at the training prior.
+    """Return the evidence of one window from its posteriors at the training prior.
 
     Shapes: posteriors (1, classes), prior (classes,).
 
@@ -165,7 +165,7 @@ def _columns(classes: tuple[str, ...]) -> list[int]:
 
 
 def _six(shares: FloatArray, classes: tuple[str, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return shares of the four, of both and of direct; zero where a model does not know one."""
+    """Return the shares of the four basic classes, of both and of direct; zero for missing classes."""
     every = np.zeros((len(shares), len(WINDOW_CLASSES)))
     every[:, _columns(classes)] = shares
     n = len(CLASSES)

@@ -291,10 +291,10 @@ def test_what_no_curve_supports_is_refused_with_what_is_known(folder: Path) -> N
     plain = replace(only, sequence=None)
     assert advised(folder, only, budget=15.0)[1].budget.onsets_per_hour == 15.0  # type: ignore[union-attr]
     for refused, asked, words in (
-        (model, {"budget": 1.4}, "budget: expected 1.5 to 30 onsets an hour"),
+        (model, {"budget": 1.4}, "budget: expected 1.5 to 30 onsets per hour"),
         (model, {"alpha": 0.06}, "alpha: expected 0.01 to 0.05 of the hops"),
         (model, {"alpha": 0.02, "budget": 6.0}, "budget, alpha: expected one of them"),
-        (only, {"budget": 6.0}, "budget: expected a model file with a curve .* only 15 onsets an hour"),
+        (only, {"budget": 6.0}, "budget: expected a model file with a curve .* only 15 onsets per hour"),
         (only, {"alpha": 0.02}, "alpha: expected a model file with a curve .* `worldstate model make`"),
         (plain, {"budget": 6.0}, "budget: expected a model with a sequence .*model make"),
         (plain, {"alpha": 0.03}, "alpha: expected a calibrated budget"),

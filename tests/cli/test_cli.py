@@ -238,7 +238,7 @@ def test_too_few_channels_names_both_counts(tmp_path, capsys):
 def test_a_budget_that_the_curve_does_not_support_names_the_range_that_it_does(tmp_path, capsys):
     sound = tmp_path / "sound.wav"
     soundfile.write(sound, np.random.default_rng(0).normal(0, 0.1, (50_000, 56)), 48000)
-    for option, asked, unit in (("--alpha", 0.99, "of the hops"), ("--budget", 0.01, "onsets an hour")):
+    for option, asked, unit in (("--alpha", 0.99, "of the hops"), ("--budget", 0.01, "onsets per hour")):
         assert main(["run", str(sound), option, str(asked)]) == 2
         line = one_line_of(capsys)
         least, most = map(float, re.search(r"expected ([0-9.]+) to ([0-9.e+]+)", line).groups())

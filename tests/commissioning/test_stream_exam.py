@@ -322,7 +322,7 @@ def test_an_alarm_keeps_what_was_asked_on_its_own_streams_and_no_lower_point_doe
     assert (curve.alpha[curve.threshold_nats < alarm.threshold_nats] > asked).all()
     assert alarm.asked_alpha == asked and alarm.promise == curve.for_alpha(alarm.promise.alpha).promise
     for wrong in (0.99 * least, 1.01 * most, -1.0, math.nan):
-        with pytest.raises(InvalidArgumentError, match=r"budget: expected .* onsets an hour"):
+        with pytest.raises(InvalidArgumentError, match=r"budget: expected .* onsets per hour"):
             curve.for_budget(wrong)
     for wrong in (0.99 * float(known[0]), 1.01 * float(known[-1]), math.nan):
         with pytest.raises(InvalidArgumentError, match=r"alpha: expected .* of the hops"):
