@@ -1,7 +1,7 @@
 """The acoustic front-end: arrays, spectra, bearing, approach rate, signatures and their bounds.
 
-Nothing here depends on the world-state: the only imports from the rest of the library are those of its ground
-floor (types, errors, checks, values).
+This package does not depend on the world-state. From the rest of the library it imports only `ground` (types,
+errors, checks, values).
 """
 
 import lazy_loader

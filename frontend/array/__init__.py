@@ -1,1 +1,1 @@
-"""Where the microphones are, and the steering vectors that follow from it."""
+"""Positions of the microphones, and the steering vectors that follow from them."""

@@ -1,1 +1,1 @@
-"""Cramer-Rao bounds of what the front-end estimates."""
+"""Cramer-Rao bounds of the front-end's estimates."""

@@ -1,7 +1,7 @@
 """Dropouts of the transport, faults of channels and the health of an array.
 
-A dropout is a run of samples that are missing, constant or repeated. All channels of a recorder share its
-buffers, so that a fault of the transport appears in all of them at the same sample; no sound does that.
+A dropout is a run of samples that are missing, constant or repeated. The channels of a recorder share its
+buffers, so a fault of the transport affects all of them at the same sample. No sound does that.
 """
 
 from collections import Counter
@@ -18,21 +18,21 @@ from worldstate.ground.typing import Float32Array, IndexArray
 
 DropoutKind = Literal["still", "splice", "repeat"]
 
-# Channels examined, evenly picked: a dropout is at the same sample in all of them.
+# Number of examined channels, evenly spaced: a dropout is at the same sample in all channels.
 _PICKED = 8
-# Shortest run of constant samples, and the chance at which quantised sound may produce a run by itself.
+# Shortest run of constant samples, and the probability of such a run in quantised sound.
 _SHORTEST_STILL = 16
 _STILL_CHANCE = 1e-12
-# Splice: mean squared prediction error over the channels, each relative to its own mean and at most 5^2, so
-# that one click is no splice; clean simulated streets stay below 7.5 and most cuts are above 15.
+# Splice: mean squared prediction error over the channels. Each channel is normalised by its mean and limited
+# to 5^2, so that one click is no splice. Clean simulated streets are below 7.5, and most cuts are above 15.
 _JUMP_CEILING = 5.0
 _JUMP_LIMIT = 12.0
-# The same relative to the other jumps of the hop: white sound from broadside jumps in all channels, too.
+# Ratio to the other jumps of the hop: white sound from broadside also causes jumps in all channels.
 _JUMP_CONTRAST = 3.0
-# The mean over fewer channels scatters too much for these limits.
+# With fewer channels the mean varies too much for these limits.
 _MIN_SPLICE_CHANNELS = 6
 # Repeat: samples whose hash has five zero bits, one in 32, are compared with those of the last one or two
-# seconds; four that agree in their lag are no chance.
+# seconds. Four matches with the same lag do not occur by chance.
 _ANCHOR_BITS = np.uint64(31)
 _MIN_ANCHORS = 4
 _GENERATION_HOPS = 10
@@ -41,7 +41,7 @@ _TINY = np.finfo(np.float32).tiny
 
 @dataclass(frozen=True, slots=True)
 class Dropout:
-    """A place where the stream is interrupted.
+    """An interruption of the stream.
 
     Examples
     --------
@@ -49,22 +49,22 @@ class Dropout:
     'still'
     """
 
-    # "still": no channel changes; "splice": the sound jumps, samples are missing; "repeat": the samples
-    # came before.
+    # "still": no channel changes; "splice": samples are missing, so the sound jumps; "repeat": the samples
+    # are a copy of earlier ones.
     kind: DropoutKind
     sample: int  # First sample, from the start of the stream
-    # Length, that of a repeat to about ten samples; None for a splice, whose length is not known.
+    # Length; for a repeat within about ten samples; None for a splice, whose length is unknown.
     n_samples: int | None
 
 
 class DropoutFinder:
-    """Find dropouts hop by hop, and the samples of the newest hop that are lost in them.
+    """Finds dropouts hop by hop, and the samples of the latest hop that are lost in them.
 
     Attributes
     ----------
     lost : ndarray of bool, shape (n,)
-        Samples of the newest hop that are constant in all channels, or repeated. A splice loses samples
-        outside the stream and marks none.
+        Samples of the latest hop that are constant in all channels or repeated. The samples lost in a splice
+        are not part of the stream, so none are marked.
     """
 
     def __init__(self, n_channels: int) -> None:
@@ -75,7 +75,7 @@ class DropoutFinder:
         self._repeats = RepeatFinder()
 
     def push(self, samples: Float32Array, alive: BoolArray) -> list[Dropout]:
-        """Take the samples (n, M) of a hop and the channels (M,) that are not constant in it."""
+        """Process the samples (n, M) of a hop; `alive` are the channels (M,) that are not constant in it."""
         start = self._n_seen - len(self._tail)
         sound = self._picked(samples, alive)
         self._tail = samples[-2:].copy()
@@ -93,19 +93,19 @@ class DropoutFinder:
         return sorted(dropouts, key=lambda dropout: dropout.sample)
 
     def _picked(self, samples: Float32Array, alive: BoolArray) -> Float32Array:
-        """Return a few live channels, shape (channels, n), the end of the last hop in front."""
+        """Return some live channels, shape (channels, n), preceded by the end of the last hop."""
         every = max(-(-int(np.add.reduce(alive)) // _PICKED), 1)
         picks = slice(None, None, every) if False not in alive else np.flatnonzero(alive)[::every]
         return np.ascontiguousarray(np.concatenate([self._tail[:, picks], samples[:, picks]]).T)
 
 
 class StillRuns:
-    """Find runs of samples in which no channel changes, across hops; a run at the start is no dropout.
+    """Finds runs without a change on any channel, across hops; a run at the start is not a dropout.
 
     Attributes
     ----------
     runs : list of (int, int)
-        First sample and end of the long runs of the newest hop, that at its end included.
+        First sample and end of the long runs in the latest hop, including an unfinished one.
     """
 
     def __init__(self) -> None:
@@ -115,13 +115,13 @@ class StillRuns:
         self._n_still, self._n_moving = 0, 0
 
     def push(self, still: BoolArray, end: int) -> list[Dropout]:
-        r"""Take one flag per sample, the last being sample `end` - 1; return the runs that end here.
+        r"""Process one flag per sample, the last for sample `end` - 1; return the runs that have ended.
 
         .. math:: L = \max\big(16,\; \ln 10^{-12} / \ln q\big)
         """
-        # L is the length that constant samples by chance, a share q of all, reach once in 1e12.
+        # Constant samples, a share q of all, reach the length L by chance with a probability of 1e-12.
         first, moving = end - len(still), (~still).nonzero()[0]
-        # The last run goes on.
+        # The last run may continue in the next hop.
         edges = np.concatenate([[-1 - self._length], moving, [len(still)]])
         lengths = edges[1:] - edges[:-1] - 1
         long = (lengths >= self._shortest(lengths[:-1])).nonzero()[0]
@@ -135,7 +135,7 @@ class StillRuns:
         return ended
 
     def _shortest(self, lengths: IndexArray) -> float:
-        """Shortest run that is not explained by the share of constant samples met so far."""
+        """Return the shortest run that is unlikely for the share of constant samples so far."""
         self._n_still += int(lengths[lengths < _SHORTEST_STILL].sum())
         self._n_moving += len(lengths)
         share = self._n_still / max(self._n_still + self._n_moving, 1)
@@ -151,12 +151,12 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
 
     Shapes: change (channels, n), still (n,).
     """
-    # d are the differences of successive samples, e their prediction errors and J the jump over two samples:
-    # a splice has J above 12 and above three times the fifth largest of the hop.
+    # With d the differences of successive samples, e their prediction errors and J the jump over two samples,
+    # a splice has a J above 12 and above three times the fifth largest J of the hop.
     error = _prediction_error(change)
     np.square(error, out=error)
     error /= np.maximum(mean(error, 1), _TINY)[:, None]
-    # An upper limit of J, without the ceiling: a clean hop ends here.
+    # An upper bound of J, without the limit: sufficient for a clean hop.
     if 2.0 * float(mean(error, 0).max()) < _JUMP_LIMIT:
         return []
     np.minimum(error, _JUMP_CEILING**2, out=error)
@@ -169,8 +169,8 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
 
 
 def _prediction_error(change: Float32Array) -> Float32Array:
-    """Error of the best first-order prediction of the differences, one coefficient for all channels."""
-    # Taken over the flat array: the few products that cross from one channel to the next do not matter.
+    """Return the error of the best first-order prediction of the differences, for all channels together."""
+    # Computed on the flat array; the few products across channel boundaries are negligible.
     flat = change.ravel()
     power, product = float(flat @ flat), float(flat[1:] @ flat[:-1])
     rule = np.float32(product / power if power > 0.0 else 0.0)
@@ -178,12 +178,12 @@ def _prediction_error(change: Float32Array) -> Float32Array:
 
 
 class RepeatFinder:
-    """Find samples that are repeated, by hashes of single samples over several channels."""
+    """Finds repeated samples by hashes of single samples over several channels."""
 
-    # Sound never repeats to the last bit on eight channels. Only hashes with five zero bits are kept (Manber,
-    # "Finding similar files in a large file system", 1994), so that the same samples are kept when they
-    # return. Memory does not grow: two generations of one second each. `run` is what the newest hop repeats,
-    # from its first sample to its end; a repeat that goes on begins where it ended in the hop before.
+    # Sound never repeats bit for bit on eight channels. Only hashes with five zero bits are stored (Manber,
+    # "Finding similar files in a large file system", 1994), so a repeated sample is stored or skipped like
+    # its original. Memory is bounded: two generations of one second each. `run` is the repeated part of the
+    # latest hop; a continued repeat begins at its end in the previous hop.
 
     def __init__(self) -> None:
         self.run = (0, 0)
@@ -196,7 +196,7 @@ class RepeatFinder:
         self._end = 0
 
     def push(self, sound: Float32Array, end: int) -> list[Dropout]:
-        r"""Take a hop of a few channels (channels, n); `end` is the number of samples so far.
+        r"""Process a hop of some channels (channels, n); `end` is the number of samples so far.
 
         .. math:: h[n] = \sum_c a_c\, b_c[n] \bmod 2^{64}, \qquad
                   \hat\ell = \mathrm{mode}\{n - n' : h[n] = h[n']\}
@@ -222,7 +222,7 @@ class RepeatFinder:
     def _anchors(self, sound: Float32Array, start: int) -> tuple[list[int], list[int]]:
         bits = np.ascontiguousarray(sound).view(np.uint32)
         hashes: NDArray[np.uint64] = (bits * self._factors[: len(bits), None]).sum(axis=0, dtype=np.uint64)
-        # High bits are the well-mixed ones of a product.
+        # The high bits of a product are well mixed.
         anchored = (hashes >> np.uint64(40)) & _ANCHOR_BITS == 0
         anchored[1:] &= hashes[1:] != hashes[:-1]
         anchored[0] = False
@@ -243,7 +243,7 @@ class RepeatFinder:
 
 
 class Fault(StrEnum):
-    """Kinds of faults of one channel.
+    """Faults of a single channel.
 
     Examples
     --------
@@ -254,29 +254,29 @@ class Fault(StrEnum):
     DEAD = "dead"
     """Constant, or 30 dB below the median channel."""
     INTERMITTENT = "intermittent"
-    """Silent or crackling in several stretches of hops."""
+    """Silent or crackling in several separate runs of hops."""
     NOISY = "noisy"
     """Incoherent with the prediction from the other channels."""
     INVERTED = "inverted"
-    """Fits its position with the opposite sign: crossed leads."""
+    """Fits its position with the opposite sign: reversed polarity."""
     SWAPPED = "swapped"
     """Fits the position of another microphone better than its own."""
     CLIPPED = "clipped"
-    """Samples pile up at one extreme value."""
+    """Many samples have the same extreme value."""
     OFFSET = "offset"
-    """A mean that is not small against the sound."""
+    """The mean is not small relative to the sound."""
     LEVEL = "level"
-    """Louder or quieter than the median channel by more than microphones differ."""
+    """Louder or quieter than the median channel by more than the tolerance of microphones."""
     GUSTS = "gusts"
-    """Much louder than the others for half a second to seconds, now and then: wind at this microphone."""
+    """Repeatedly much louder than the others for half a second to seconds: wind at this microphone."""
     DELAY = "delayed"
-    """Later or earlier than sound from any direction, by an amount that stays the same."""
+    """Constantly later or earlier than sound from any direction."""
     DRIFT = "drifting"
-    """Later and later, or earlier and earlier: a card with a clock of its own."""
+    """Increasingly late or early: a sound card with its own clock."""
 
 
 MASKED_FAULTS = frozenset(Fault) - {Fault.CLIPPED, Fault.OFFSET, Fault.LEVEL, Fault.GUSTS}
-"""Faults for which a channel is left out. The others leave its phase intact, which is all that PHAT uses."""
+"""Faults for which a channel is excluded. The others leave its phase intact, and PHAT uses only phases."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,17 +286,18 @@ class ChannelFault:
     Parameters
     ----------
     channel : int
-        From 0, in the order of the array.
+        Number from 0, in the order of the array.
     fault : Fault
-        What is wrong.
+        Kind of the fault.
     value : float
         Size of the fault. Dead and intermittent: share of the last five seconds. Noisy and inverted:
-        coherence with the prediction from the other channels, over the median channel's. Swapped: gain in
-        that coherence at the other position, -2 to 2. Clipped: share of samples. Offset: mean over the
-        peak-to-peak value. Level: dB relative to the median channel. Gusts: share of the last ten seconds.
-        Delayed: seconds. Drifting: seconds a second. Swapped, up to 16 channels: gain in sharpness, nats.
+        coherence with the prediction from the other channels, relative to the median channel. Swapped: gain
+        in this coherence at the other position, -2 to 2. Clipped: share of samples. Offset: mean divided by
+        the peak-to-peak value. Level: dB relative to the median channel. Gusts: share of the last ten
+        seconds. Delayed: seconds. Drifting: seconds per second. Swapped, up to 16 channels: gain in
+        sharpness, nats.
     looks_like : int or None
-        Swapped: the channel whose position it fits.
+        Swapped: the channel whose position fits.
     std : float or None
         Delayed and drifting: standard deviation of `value`.
 
@@ -320,18 +321,18 @@ class ArrayHealth:
     Parameters
     ----------
     mask : ChannelMask
-        Microphones that count in this hop.
+        Microphones that are used in this hop.
     faults : tuple of ChannelFault
-        Present faults by channel; a channel may have several.
+        Current faults by channel; a channel may have several.
     dropouts : tuple of Dropout
-        The last 16 places in the stream where samples are missing, constant or repeated.
+        The last 16 dropouts.
     n_dropouts : int
-        Number of such places since the start.
+        Number of dropouts since the start.
     coherence : float or NotUsable
-        Median over the channels of the coherence with the prediction from the others. Not usable in the
-        first second and without a coherent sound; swapped, inverted and noisy channels are then not found.
+        Median over the channels of the coherence with the prediction from the others. Not usable in the first
+        second or without coherent sound; swapped, inverted and noisy channels are then not detected.
     clipped : float
-        Share of the samples of the hop that are clipped, over all channels.
+        Share of clipped samples in the hop, over all channels.
 
     Examples
     --------
@@ -349,19 +350,19 @@ class ArrayHealth:
 
     @classmethod
     def unknown(cls, n_channels: int, reason: str = "no hop so far") -> "ArrayHealth":
-        """Return the health of an array of which nothing is known: all channels kept.
+        """Return the health of an array without information: all channels are kept.
 
         Parameters
         ----------
         n_channels : int
             Number of microphones M.
         reason : str
-            Why there is no estimate of the coherence.
+            Reason for the missing estimate of the coherence.
 
         Returns
         -------
         ArrayHealth
-            Without faults.
+            Health without faults.
 
         Examples
         --------
@@ -377,13 +378,13 @@ class ArrayHealth:
 
 
 def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[ChannelFault]:
-    """List one kind of fault for all channels in which it was found; both arrays have shape (M,)."""
+    """Return one kind of fault for all affected channels; both arrays have shape (M,)."""
     return [ChannelFault(m, fault, float(values[m])) for m in found.nonzero()[0].tolist()]
 
 
 def repeated(
     found: list[ChannelFault], before: list[ChannelFault]
 ) -> tuple[list[ChannelFault], list[ChannelFault]]:
-    """Return the faults that were found the last time, too, and all of them for the next time."""
+    """Return the faults that were also found the last time, and all faults for the next comparison."""
     known = {(one.channel, one.fault) for one in before}
     return [one for one in found if (one.channel, one.fault) in known], found

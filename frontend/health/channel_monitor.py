@@ -1,4 +1,4 @@
-"""Monitor the channels of a stream, hop by hop: levels, clipping, activity, dropouts, geometry."""
+"""Monitor of a stream's channels, hop by hop: levels, clipping, activity, dropouts, geometry."""
 
 from collections import deque
 
@@ -20,31 +20,31 @@ from .channel_health import (
 )
 from .geometry_check import GeometryCheck
 
-# Width of the interval below an extreme, in halves of the span: an unclipped sound has more samples there
+# Width of the interval below an extreme, relative to half the span: unclipped sound has more samples there
 # than at the extreme itself.
 _SHELL = np.float32(0.1)
-# Step to the next value, in halves of the span, from which coarse quantisation would be taken for clipping.
+# Step to the next value, relative to half the span, above which quantisation would look like clipping.
 _COARSE = np.float32(0.02)
-# Fewer samples at the extreme occur by chance.
+# A smaller number of samples at the extreme occurs by chance.
 _MIN_COUNT = 16
 
 
 class ClippingCounter:
-    """Count samples at and just below the highest and the lowest value of every channel."""
+    """Counts samples at and just below the highest and the lowest value of every channel."""
 
-    # An unclipped sound reaches its extreme once and the values just below it more often; a clipped one stays
-    # at it. Only hops that reach the extreme again are counted, so that a clean stream costs nothing; a new
-    # extreme restarts the count, because the old one was no clipping level.
+    # Unclipped sound reaches its extreme once and the values just below it more often; clipped sound stays at
+    # it. Only hops that reach the extreme again are counted, so a clean stream takes no time. A new extreme
+    # restarts the count, because the old one was not a clipping level.
 
     def __init__(self, n_channels: int) -> None:
         self._n_samples = 0
         self._extreme = np.full((2, n_channels), -np.inf, np.float32)
         self._at = np.zeros((2, n_channels), np.int64)
         self._below = np.zeros((2, n_channels), np.int64)
-        self.newest_share = 0.0  # Share of the newest hop at a clipping level, over all channels
+        self.newest_share = 0.0  # Share of clipped samples in the latest hop, over all channels
 
     def push(self, samples: Float32Array, lowest: Float32Array, highest: Float32Array) -> None:
-        r"""Take the samples (n, M) of a hop and their extremes (M,).
+        r"""Process the samples (n, M) of a hop and their extremes (M,).
 
         .. math:: n_{at} = \#\{x = x_{max}\}, \qquad
                   n_{below} = \#\{x_{max} - \tfrac1{20} s \le x < x_{max}\}
@@ -79,35 +79,36 @@ class ClippingCounter:
         return np.asarray((self._at >= _MIN_COUNT) & (self._at > self._below))
 
     def clipped_share(self) -> FloatArray:
-        r"""Share of all samples at a clipping level, shape (M,); 0 for channels without one.
+        r"""Return the share of all samples at a clipping level, shape (M,); 0 for channels without one.
 
         .. math:: q = \frac1n \sum_{sides} n_{at}\, [n_{at} \ge 16,\; n_{at} > n_{below}]
         """
         return np.asarray(np.where(self._is_clipped, self._at, 0).sum(axis=0) / max(self._n_samples, 1))
 
 
-# Ten seconds; gusts last half a second to three, with lulls of as much between them.
+# Ten seconds; gusts last from half a second to three seconds, with equally long pauses.
 _LEVEL_HOPS = 100
-# Median of half a second: single hops of sound scatter by 2 dB between microphones, and a crackle is one hop.
+# Median of half a second: single hops vary by 2 dB between microphones, and a crackle lasts one hop.
 _SMOOTHED = 5
-# Six seconds: after two, the first gust is taken for a gain.
+# Six seconds: after two, the first gust would look like a wrong gain.
 _FEWEST_HOPS = 60
-# The fifth of the hops that is nearest to the others': in the lulls of gusts a channel has its own level.
+# The quietest fifth of the hops: between gusts a channel has its usual level.
 _QUIET = 0.2
-# Simulated streets, 56 and 8 microphones, standing and moving ego: healthy levels below 2.2 dB, their rise
-# within ten seconds below 0.9 dB, of a siren that interferes at one microphone 3.1 dB; gusts rise by 6 to 19.
+# Simulated streets, 56 and 8 microphones, standing and moving ego: healthy levels are below 2.2 dB, and their
+# rise within ten seconds below 0.9 dB (3.1 dB for a siren that interferes at one microphone). Gusts rise by 6
+# to 19 dB.
 _LEVEL_DB, _GUST_DB = 4.0, 4.5
-# Hops of half a second's mean: one bang is no gust.
+# Number of smoothed hops, so that a single bang is not a gust.
 _FEWEST_GUSTY = 3
 _TINY = np.finfo(np.float64).tiny
 
 
 class ChannelLevels:
-    r"""Level of every channel against the median channel, a mean over bins in decibels.
+    r"""Level of every channel relative to the median channel, averaged over bins in decibels.
 
     .. math:: L_m = \Big\langle 10 \lg \frac{E_{km}}{\mathrm{median}_j\, E_{kj}} \Big\rangle_k
 
-    The mean of logarithms: a tone that interferes at one microphone is one bin of many.
+    In a mean of logarithms, a tone that interferes at one microphone affects only one of many bins.
     """
 
     def __init__(self, n_channels: int) -> None:
@@ -116,11 +117,11 @@ class ChannelLevels:
         self._count = np.zeros(n_channels, np.int64)
 
     def push(self, powers: FloatArray, good: BoolArray) -> None:
-        """Take the mean power of one hop per bin and channel, (K, M), and the channels that sound, (M,)."""
+        """Process the mean power of a hop by bin and channel, (K, M); `good` are usable channels, (M,)."""
         if True in good:
             level = 10.0 * np.log10(np.maximum(powers, _TINY))
             level -= median(level[:, good])[:, None]
-            # A hop in which a channel breaks off says nothing of its level.
+            # A hop in which a channel fails gives no information about its level.
             self._latest = np.where(good, mean(level, 0), self._latest)
         self._hops.append(self._latest)
         self._count += good
@@ -131,7 +132,7 @@ class ChannelLevels:
         .. math:: g_m = q_{20\%}(L) > 4 \;\text{or}\; q_{80\%}(L) < -4, \qquad
                   \#\{L - q_{20\%}(L) > 4.5\} \ge 3
 
-        A channel with gusts has no gain.
+        A channel with gusts has no gain fault.
         """
         if len(self._hops) < _FEWEST_HOPS:
             return []
@@ -145,17 +146,17 @@ class ChannelLevels:
         return faults_where(Fault.LEVEL, wrong, level) + faults_where(Fault.GUSTS, gusts, gusty / len(smooth))
 
 
-# Five seconds: an intermittent contact comes back within that, and one bad hop is forgotten soon enough.
+# Five seconds: an intermittent contact fails again within this time, and a single bad hop is soon forgotten.
 _ACTIVITY_HOPS = 50
-# A hop without any change on any channel is a dropout of the transport; after a second the array is dead.
+# A hop without a change on any channel is a dropout of the transport; after a second the array is dead.
 _SILENCE_HOPS = 10
 
 
 class ChannelActivity:
     """Flags of unusable hops of every channel over the last five seconds."""
 
-    # One stretch of bad hops that lasts until now is dead; several, or one that has ended, are intermittent.
-    # A single bad hop is masked and not reported: a slammed door is no fault.
+    # One run of bad hops that lasts until now means dead; several, or one that has ended, mean intermittent.
+    # A single bad hop is masked but not reported, because a slammed door is no fault.
 
     def __init__(self, n_channels: int) -> None:
         self._bad: deque[BoolArray] = deque(maxlen=_ACTIVITY_HOPS)
@@ -164,15 +165,15 @@ class ChannelActivity:
         self._share = np.zeros(n_channels)
 
     def push(self, bad: BoolArray) -> BoolArray:
-        """Take one flag per channel, shape (M,), and return it."""
+        """Add one flag per channel, shape (M,), and return the flags."""
         if self._n_silent >= _SILENCE_HOPS:
-            # What all of them lost is no fault of any.
+            # If all channels failed together, no single channel is faulty.
             self._bad.extend([np.zeros_like(bad)] * len(self._bad))
         self._n_silent = 0
         return self._remember(bad)
 
     def all_silent(self) -> BoolArray:
-        """Take a hop in which all channels are silent; return flags that are set after one second of this."""
+        """Add a hop in which all channels are silent; return flags, set after one second of silence."""
         self._n_silent += 1
         silent = np.full(len(self._share), self._n_silent >= _SILENCE_HOPS)
         return self._remember(silent) if silent.any() else silent
@@ -204,29 +205,29 @@ class ChannelActivity:
 
 # Time constant of the means of span and sample, hops: three seconds.
 _HOPS = 30
-# Mean square of the band, relative to the median channel, below which a channel is silent: -30 dB, far below
-# the few dB by which usable microphones differ.
+# Mean square of the band, relative to the median channel, below which a channel is silent: -30 dB. Usable
+# microphones differ only by a few dB.
 _SILENT = 1e-3
-# The same within one frame, -50 dB: destructive interference does not reach that over a whole band.
+# The same within one frame, -50 dB: destructive interference does not reach this over a whole band.
 _DROPPED = 1e-5
-# A channel whose peak-to-peak value grows by this factor more than that of the others crackles; a loud event
-# raises all of them.
+# A channel crackles if its peak-to-peak value grows by this factor more than those of the others; a loud
+# event raises all channels.
 _CRACKLE = 4.0
-# A mean above a tenth of the peak-to-peak sound (0.7 of its standard deviation), judged after two seconds.
+# A mean above a tenth of the peak-to-peak value (0.7 standard deviations), evaluated after two seconds.
 _OFFSET = 0.1
 _SETTLED_HOPS = 20
-# One sample in ten thousand; a lone peak is less.
+# One sample in ten thousand; a single peak is less.
 _CLIPPED_SHARE = 1e-4
-# Enough for a report; the count goes on beyond them.
+# Enough for a report; the number of dropouts includes older ones.
 _KEPT_DROPOUTS = 16
-# Samples taken as one row by `_extremes`: a minimum along long rows is several times faster.
+# Samples that `_extremes` combines into one row: a minimum along long rows is several times faster.
 _ROWS = 16
-# Statistics with a memory of seconds are evaluated once a second.
+# Statistics over seconds are evaluated once per second.
 _EVERY_HOPS = 10
 
 
 class ChannelMonitor:
-    """Collect the statistics of all channels and report their faults; memory does not grow."""
+    """Collects the statistics of all channels and reports their faults; memory is bounded."""
 
     def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         n = array.n_microphones
@@ -243,7 +244,7 @@ class ChannelMonitor:
         self._extremes: tuple[Float32Array, Float32Array] = (np.zeros(n, np.float32),) * 2
 
     def find_lost(self, samples: Float32Array) -> BoolArray:
-        """Take the samples (n, M) of a hop; return which of them are lost in all channels, (n,)."""
+        """Process the samples (n, M) of a hop; return which of them are lost in all channels, (n,)."""
         self._extremes = lowest, highest = _extremes(samples)
         self._clipping.push(samples, lowest, highest)
         dropouts = self._dropout_finder.push(samples, highest > lowest)
@@ -254,7 +255,7 @@ class ChannelMonitor:
     def push(
         self, samples: Float32Array, energies: FloatArray, powers: Float32Array, matrices: Complex64Array
     ) -> ArrayHealth:
-        r"""Take the hop that `find_lost` took, its lost frames left out; return channels to keep and faults.
+        r"""Process the hop of `find_lost` without its lost frames; return the kept channels and the faults.
 
         .. math:: \langle E_{tm} / \tilde E_t \rangle_t < 10^{-3}, \qquad
                   \min_t E_{tm} / \tilde E_t < 10^{-5}, \qquad
@@ -263,8 +264,8 @@ class ChannelMonitor:
         Shapes: samples (n, M), energies (frames, M), powers (frames, bins, M), matrices (K, M, M).
         """
         # E is the mean square of a frame and channel, E~ that of the median channel, s the peak-to-peak value
-        # and s-bar its running mean: a channel is left out of the hop if it is silent, breaks off or crackles
-        # in it, or if it has one of `MASKED_FAULTS`.
+        # and s-bar its running mean. A channel is excluded from the hop if it is silent, fails or crackles in
+        # it, or if it has one of `MASKED_FAULTS`.
         lowest, highest = self._extremes
         span = highest - lowest
         alive = span > 0.0
@@ -277,7 +278,7 @@ class ChannelMonitor:
         return self._report(bad)
 
     def _silent(self, energies: FloatArray, alive: BoolArray) -> BoolArray:
-        """Flag the channels that are silent in this hop or break off in it."""
+        """Return the channels that are silent in this hop or fail in it."""
         if True not in alive:
             return ~alive
         typical = np.maximum(median(energies[:, alive]), _TINY)[:, None]
@@ -285,7 +286,7 @@ class ChannelMonitor:
         return np.asarray(~alive | (level < _SILENT) | np.logical_or.reduce(energies < _DROPPED * typical))
 
     def _judge_hop(self, samples: Float32Array, span: Float32Array, silent: BoolArray) -> BoolArray:
-        """Flag the channels that are silent or crackle in this hop."""
+        """Return the channels that are silent or crackle in this hop."""
         alive = span > 0.0
         if True not in alive:
             return self._activity.all_silent()
@@ -296,7 +297,7 @@ class ChannelMonitor:
             growth = np.divide(span, mean_span, out=np.zeros(len(span)), where=known)
             bad |= growth > _CRACKLE * median(growth[known])
         share = np.full(len(samples), 1.0 / len(samples), np.float32)
-        # Exponential means over the good hops, ordinary ones until the time constant has passed:
+        # Exponential means over the good hops; arithmetic ones until the time constant has passed:
         # mu <- mu + (x - mu) / min(n, 30).
         self._n_good += ~bad
         weight = ~bad / np.minimum(np.maximum(self._n_good, 1), _HOPS)
@@ -317,7 +318,7 @@ class ChannelMonitor:
         return ArrayHealth(ChannelMask(keep), tuple(faults), *dropouts, coherence, clipped)
 
     def _single_channel_faults(self) -> list[ChannelFault]:
-        """Faults seen on a channel by itself: clipping, offset, level, gusts."""
+        """Return faults that are visible on a single channel: clipping, offset, level, gusts."""
         usable = ~self._activity.suspects
         clipped = self._clipping.clipped_share()
         span, mean = self._means
@@ -331,7 +332,7 @@ class ChannelMonitor:
 
 
 def _extremes(samples: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Lowest and highest sample of every channel, (M,) each."""
+    """Return the lowest and the highest sample of every channel, (M,) each."""
     rows, n_channels = len(samples) // _ROWS * _ROWS, samples.shape[1]
     wide, rest = samples[:rows].reshape(-1, _ROWS * n_channels), samples[rows:]
     lowest = np.concatenate([wide.min(axis=0, initial=np.inf).reshape(-1, n_channels), rest]).min(axis=0)

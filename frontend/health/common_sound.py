@@ -1,15 +1,15 @@
-r"""Sound that microphones have in common, and whether it can be that of far sources at their positions.
+r"""Sound common to the microphones, and whether it can come from far sources at their positions.
 
-Wind, the noise of converters and samples read in a wrong format are independent between microphones; the
-sound of a street is not. Over pairs and bins where a diffuse field has a coherence above 0.1,
+Wind, converter noise and samples in a wrong format are independent between microphones, but the sound of a
+street is not. Over pairs and bins with a coherence above 0.1 in a diffuse field,
 
 .. math:: v = \frac{\sum_{ijk} \big( |S_{kij}|^2 - n_2 \big) - 3 n_2 \sqrt{2 N}}
           {n_1^2 \sum_{ijk} \Gamma_{kij}^2}, \qquad
           S \leftarrow 0.8\, S + \sum_t Z Z^H,
 
-with the frames n_1 in S, the power n_2 that independent noise has in a pair, and N pairs and bins. The same
-of every bin shows how much of the band such noise covers. Channels that are in another order, late or
-inverted have as much in common; `FarField` compares that with the positions.
+with the number of frames n_1 in S, the power n_2 of independent noise in a pair, and N pairs and bins. The
+same statistic per bin gives the share of the band that such noise covers. Channels that are permuted, late or
+inverted have as much in common, so `FarField` compares their sound with the positions.
 """
 
 from collections import deque
@@ -23,44 +23,46 @@ from worldstate.ground.typing import BoolArray, Complex64Array, FloatArray, IntA
 from .geometry_check import diffuse_coherence
 
 NOTHING_IN_COMMON = "no sound common to the microphones"
-"""Why a hop of independent noise is not heard."""
+"""Reason for an unusable hop with independent noise."""
 OUT_OF_PLACE = "sound that contradicts the positions of the microphones"
-"""Why a hop is not heard of channels in another order, late or inverted."""
+"""Reason for an unusable hop with permuted, late or inverted channels."""
 ARRAY_FAULTS = NOTHING_IN_COMMON, OUT_OF_PLACE
-"""Why nothing of an array is heard, whatever its single microphones are."""
-# Pairs and bins of less coherence in a diffuse field add noise and little that is common.
+"""Reasons for which the whole array is unusable, even if each microphone works."""
+# Pairs and bins with less coherence in a diffuse field add mainly noise.
 _LEAST_COHERENCE = 0.1
-# Microphones, evenly picked: 12 of 56 separate sound from noise as all of them do, in a tenth of the time.
+# Number of microphones, evenly spaced: 12 of 56 separate sound from noise as well as all, ten times faster.
 _MOST_CHANNELS = 12
-# Of the last half second: noise is found within it, and one hop of four microphones scatters too much.
+# Weight of earlier hops, about half a second: short enough to detect noise, while one hop varies too much.
 _KEPT = np.float32(0.8)
-# Power of a sum of T independent frames over T: neighbours share half a Hann window and correlate by 1/6.
+# Power of a sum of T independent frames divided by T: neighbours share half a Hann window (correlation 1/6).
 _OVERLAP = 1.0 + 2.0 / 36.0
-# Frames without which nothing is compared: after a loss the sums of what was before it fade for ever.
+# Fewest frames for a comparison: after a loss of sound, the sums of earlier frames never reach zero.
 _LEAST_FRAMES = 1.0
-# Standard deviations of noise that are taken off v: in the first hops it scatters most. Three of them,
-# at nine frames a hop, may be no more than the least v of clean streets less the most that is unheard.
+# Standard deviations of noise that are subtracted from v, which varies most in the first hops. Three of them,
+# at nine frames per hop, may be at most the minimum v of clean streets minus the maximum of unusable ones.
 _SIGMAS, _FRAMES, _MOST_STD = 3.0, 9.0, 0.03
-# Coherence over that of a diffuse field: of clean simulated streets of both renderers, 4 to 56 microphones,
-# 0.09 and more in 99 of 100 hops (the emptiest, four microphones 0.3 to 0.9 m apart), of 4,202 hops of real
-# ones 0.28 and more, of a quiet street under independent noise 10 dB louder 0.03 and less.
+# Coherence relative to a diffuse field. Clean simulated streets of both renderers with 4 to 56 microphones
+# have at least 0.09 in 99 % of the hops (lowest for four microphones 0.3 to 0.9 m apart), 4,202 hops of real
+# streets at least 0.28, and a quiet street under independent noise 10 dB louder at most 0.03.
 _IN_COMMON = (0.04, 0.1)
-# The same of a bin, and share of the bins that have more, if as many decide: in clean streets 0.5 and more of
-# the six lowest of 56 microphones, whose two lowest wind covers; in others 0.64 and more.
+# The same for a bin, limits for the share of bins above it, and the fewest bins. In clean streets, 0.5 or
+# more of the six lowest bins are above it with 56 microphones, whose two lowest are covered by wind; with
+# other arrays 0.64 or more.
 _IN_BIN, _BINS, _FEWEST_BINS = 0.04, (0.3, 0.5), 6
-# Three hops: sound that is in common for less is the scatter of these shares.
+# Three hops: a shorter change is random variation.
 _COVERED_HOPS = 3
-# Misfit of a second: clean streets of both renderers, 11 arrays of 4 to 56, at most 0.32; channels in random
-# orders mostly 0.7 to 1.3; a siren and its echoes, which last as long, 0.7 to 1 for seven seconds.
+# Misfit of a second: at most 0.32 in clean streets of both renderers with 11 arrays of 4 to 56; mostly 0.7 to
+# 1.3 for channels in random orders; 0.7 to 1 during seven seconds of a siren with equally long echoes.
 _MISFIT = 0.4
-# What a second adds to the agreement, and its range: a right order fits again and again, and a siren makes a
-# wrong one of none that has fitted for half as long; three seconds that fit make a wrong one right.
+# Change of the agreement per second, and its range. A right order fits repeatedly, and a siren makes it
+# negative only if it lasts twice as long as the fits before. Three seconds that fit make a negative agreement
+# positive.
 _VOTES, _AGREEMENT = (-0.5, 1.0), (-3.0, 20.0)
 _EVERY_HOPS = 10
 
 
 class CommonSound:
-    """Compare the coherence of the microphones with that of far sources; memory does not grow."""
+    """Compares the coherence of the microphones with that of far sources; memory is bounded."""
 
     def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         self._picked = slice(None, None, -(-array.n_microphones // _MOST_CHANNELS))
@@ -76,7 +78,7 @@ class CommonSound:
         self._choose(self._placed)
 
     def _choose(self, kept: BoolArray) -> None:
-        """Go on with the pairs of some channels, (M,)."""
+        """Use the pairs of these channels, (M,), from now on."""
         chosen = self._used & kept[:, None] & kept
         self._kept, self._chosen = kept, chosen.astype(np.float32)
         self._count = count = chosen.sum(axis=(1, 2))
@@ -87,10 +89,10 @@ class CommonSound:
         self._bins = np.flatnonzero(bins) if np.count_nonzero(bins) >= _FEWEST_BINS else None
 
     def push(self, matrices: Complex64Array, n_frames: int, keep: BoolArray) -> tuple[float, str | None]:
-        """Take the cross-spectra (K, M, M) of a hop and the microphones kept (M,); return what can be heard.
+        """Process the cross-spectra (K, M, M) of a hop; `keep` are the usable microphones, (M,).
 
-        That is a share, and why not more. Of too few microphones it is that of the hop before: independent
-        noise looks like faults, too.
+        Return the share of usable sound and the reason if it is below 1. With too few microphones the share
+        of the last hop is returned, because independent noise also looks like faults.
         """
         self._sum *= _KEPT
         self._sum += matrices[:, self._picked, self._picked]
@@ -110,7 +112,7 @@ class CommonSound:
         return share, NOTHING_IN_COMMON if share < 1.0 else None
 
     def _compare_noise(self) -> None:
-        """Take the share that independent noise leaves, of the whole band and of its bins."""
+        """Add the share of sound without independent noise, from the whole band and from its bins."""
         if not self._decides:
             return
         noise, (scatter, scatter_of_all) = self._noise / self._n_frames**2, self._scatter
@@ -125,7 +127,7 @@ class CommonSound:
         self._common.append(1.0 - covered)
 
     def _compare_places(self) -> None:
-        """Compare the coherence of the last half second with the positions of the channels that are kept."""
+        """Compare the coherence of the last half second with the positions of the kept channels."""
         kept = self._kept
         if self._far_field is None or not np.array_equal(kept, self._placed):
             self._placed, self._far_field = kept, FarField(self._places[kept], self._frequencies_hz)
@@ -137,34 +139,35 @@ class CommonSound:
 
     @staticmethod
     def decides(count: IntArray, diffuse: FloatArray) -> BoolArray:
-        """Return whether so many pairs, both orders counted, tell sound from noise, together or a bin."""
+        """Return whether this number of ordered pairs is enough to separate sound from noise."""
         shrink = float((1.0 - _KEPT) / (1.0 + _KEPT)) / _FRAMES
         return np.asarray(np.sqrt(2.0 * count) * shrink < _MOST_STD * diffuse)
 
 
-# Variance of a coherence of independent noise over half a second, 19 frames a hop.
+# Variance of a coherence of independent noise over half a second, 19 frames per hop.
 _CHANCE = 0.003
-# Sources that sound in one bin alone: the others sound in all.
+# Share of the energy from sources in one bin only; the other sources cover all bins.
 _ALONE = 0.1
-# Standard deviations of noise that a random order leaves unexplained: with less, as in the long waves of a
-# small board, nothing is known of the order.
+# Standard deviations of noise that a random order must leave unexplained. With less, for example at the long
+# waves of a small board, the order cannot be determined.
 _SURE = 8.0
-# Pairs times bins; four bins of twelve microphones find as much as all of them.
+# Pairs times bins; four bins of twelve microphones are as sensitive as all bins.
 _MOST_VALUES = 300
 
 
 class FarField:
-    r"""Compare coherences with what far sources can give at the positions of the microphones, (M, 3).
+    r"""Comparison of coherences with those of far sources at the positions of the microphones, (M, 3).
 
-    Far from all sources the coherence r of a pair depends on its displacement d and the wave number k alone.
-    Over all directions of a wave the real parts of two of them have the covariance C+, the imaginary ones C-,
+    Far from all sources, the coherence r of a pair depends only on its displacement d and the wave number k.
+    Over all directions of a wave, the real parts of two pairs have the covariance C+ and the imaginary parts
+    C-,
 
     .. math:: C^\pm_{ab} = \tfrac12 \big( \mathrm{sinc} |k_a d_a - k_b d_b|
               \pm \mathrm{sinc} |k_a d_a + k_b d_b| \big), \qquad
               u(r) = \lambda\, r^T (C + \lambda I)^{-1} r - \frac{\lambda}{1/2 + \lambda}\, r^T r,
 
-    and u is what that leaves unexplained, beyond what it would of pairs without any relation. The misfit is u
-    over its mean over all orders of the channels: about 1 in a random order, 0 and less in the right one.
+    where u is the unexplained part minus that of unrelated pairs. The misfit is u divided by its mean over
+    all orders of the channels: about 1 in a random order, and 0 or less in the right one.
 
     References
     ----------
@@ -193,7 +196,7 @@ class FarField:
         self._both = self._both.astype(np.float32)
 
     def misfit(self, coherence: Complex64Array, noise: float) -> float | None:
-        """Take a coherence (K, M, M) and the power of independent noise in it; return the misfit if known."""
+        """Return the misfit of a coherence (K, M, M) with a power of independent noise; None if unknown."""
         pairs = coherence[self._bins][:, *self._pair].ravel()
         parts = np.stack([pairs.real, pairs.imag])[:, None, :, None]
         left = (parts * (self._both @ parts)).sum(axis=(0, 2, 3)) - noise * self._of_noise
@@ -202,8 +205,8 @@ class FarField:
 
 
 def _in_any_order(weights: FloatArray, ends: FloatArray) -> FloatArray:
-    """Mean of weights (KP, KP) over all orders of the microphones that are the ends of pairs, (P, M)."""
-    # Two pairs are alike to all others that share as many microphones, and these with the same sign.
+    """Return the mean of weights (KP, KP) over all orders of the microphones; `ends` of pairs, (P, M)."""
+    # The mean depends only on the number of microphones that two pairs share, and on the sign.
     shared, one = ends @ ends.T, np.eye(len(ends))
     groups = [one, shared - 2.0 * one] + ([(shared == 0.0).astype(float)] if (ends >= 0.0).all() else [])
     by_bins = weights.reshape(-1, len(ends), len(weights) // len(ends), len(ends))

@@ -1,18 +1,18 @@
-r"""Positions of an array that explain its sound better than those of its file.
+r"""Positions that explain the sound of an array better than those of its file.
 
-The order and the size that fit best are taken first, or what the delays of level waves give by themselves
-where that explains more. From there every coordinate is moved so that
+The descent starts from the best-fitting order and size, or from the delays of horizontal waves if these
+explain more. It changes every coordinate so that
 
 .. math:: \ln\Big(1 - \frac{\sum_s E_s(p)}{P}\Big) + \sum_m \frac{\|p_m - p^0_m\|^2}{D^2}
 
-is least, with the energy E of part s that a plane wave over a diffuse field explains (`position_check`), all
-coherent energy P, the extent D of the array and its positions :math:`p^0`: what the sound does not show stays
-as it was given. A turn and a mirror image of the whole array are never seen. An axis along which the array
-has no extent is not moved, and one along which no sound comes is held poorly.
+is minimal. E is the energy of part s that a plane wave in a diffuse field explains (`position_check`), P the
+total coherent energy, D the extent of the array and :math:`p^0` its given positions. Coordinates that the
+sound does not determine keep their given values. Rotations and mirror images of the whole array cannot be
+determined. An axis without extent is not changed, and an axis without sound along it is uncertain.
 
 References
 ----------
-S. Thrun, "Affine structure from sound", NIPS 2005 (positions by far sources whose places are not known).
+S. Thrun, "Affine structure from sound", NIPS 2005 (positions from far sources at unknown places).
 """
 
 import math
@@ -30,41 +30,43 @@ from worldstate.ground.typing import BoolArray, FloatArray
 
 from .position_check import FEW, LEAST_PARTS, NO_SIDE, OFF_BY_30, Comparison, PositionCheck
 
-# Parts of all recordings together: two minutes, of which one evaluation takes some 10 ms with four channels.
+# Number of parts over all recordings: two minutes. One evaluation takes about 10 ms with four channels.
 _PARTS = 480
-# Sizes to begin from, of which the best is within the reach of a descent.
+# Initial sizes; the best of them is close enough for a descent.
 _SIZES = (1.0, 0.5, 0.6, 0.7, 0.85, 1.18, 1.43, 1.67, 2.0)
-# Of the extent, the longest delay; of the median rest, that of parts that are one wave, chosen so many times;
-# of the longest delay, two steps of the delays that are tried.
+# Longest delay relative to the extent; largest residual of parts with a single wave relative to the median,
+# and number of selections; two steps of the tested delays relative to the longest delay.
 _LONGEST, _PLAIN, _ROUNDS, _FINE = 1.5, 2.0, 3, 0.02
-# Mean of the unit vectors towards all parts from which on they do not show the extent along them: two sources
-# 20 degrees apart in the open have 0.99, and leave errors as large as those given; 60 degrees apart in a room
-# 0.83, and 5 mm. Of true positions the explained share is 0.66 and more (rooms of 0.8 s, talkers 2.5 m away).
+# Mean of the unit vectors towards all parts above which they do not determine the extent along this
+# direction. Two sources 20 degrees apart in the open have 0.99, and the errors remain as large as before; two
+# sources 60 degrees apart in a room have 0.83, with errors of 5 mm. True positions explain a share of 0.66 or
+# more (rooms with 0.8 s of reverberation, talkers 2.5 m away).
 _ONE_SIDE, _LEAST_EXPLAINED = 0.95, 0.6
-# Least share of the coherent energy that counts as unexplained, so that a perfect fit has a logarithm.
+# Smallest unexplained share of the coherent energy, so that a perfect fit has a finite logarithm.
 _LEAST_LEFT = 1e-3
-# Step of the numerical gradient, in extents of the array: directions are 5 degrees apart, and smaller steps
-# see where the best one changes.
+# Step of the numerical gradient, in extents of the array: directions are 5 degrees apart, and with smaller
+# steps the discrete change of the best direction disturbs the gradient.
 _STEP = 2e-3
-# Relative gain at which the descent ends: a smaller one takes four times as long and moves nothing by 0.1 mm.
+# Relative gain at which the descent ends: a smaller value takes four times as long and changes less than 0.1
+# mm.
 _FALL = 1e-4
-# Extent along an axis over the largest below which the positions are flat there.
+# Ratio of the extent along an axis to the largest extent below which the array is flat along this axis.
 _FLAT = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedPositions:
-    """Positions that explain the sound of an array at least as well as those given.
+    """Positions that explain the sound of an array at least as well as the given ones.
 
     Parameters
     ----------
     positions_m : ndarray, shape (M, 3)
-        In `base_link` axes, metres; those given where no others explain significantly more.
+        In `base_link` axes, metres; the given ones if no others explain significantly more.
     explained, explained_before : float
-        Share of the coherent energy that these and those given explain, in parts that were not fitted; in the
-        same ones where there are less than 4 s, which `unjudged` then states.
+        Share of the coherent energy that these and the given positions explain, in parts that were not
+        fitted. With less than 4 s of sound the parts are the fitted ones, and `unjudged` states this.
     unjudged : tuple of str
-        What this sound does not show: there the positions are near those given.
+        Properties that this sound does not determine; there the positions are close to the given ones.
 
     Examples
     --------
@@ -79,30 +81,30 @@ class FittedPositions:
 
 
 def fit_positions(checks: Sequence[PositionCheck], usable: BoolArray) -> FittedPositions:
-    """Fit positions to the recordings of one array that checks have taken.
+    """Fit positions to the recordings of one array.
 
-    Up to a turn and a mirror image, which no sound shows, plane waves of three directions give a ring within
-    1 mm. In simulated rooms (pyroomacoustics, six talkers and more) rings of 4 and 6 with radii of 3.2 and
-    4.6 cm whose file is 40 % too large, 30 % too small, in any order or 1 to 2 cm off at random come out
-    within 4 mm, 8 microphones on 24 cm within 11 mm.
+    Sound does not determine rotations and mirror images. Apart from them, plane waves from three directions
+    give a ring within 1 mm. In simulated rooms (pyroomacoustics, at least six talkers), the given positions
+    of rings of 4 and 6 with radii of 3.2 and 4.6 cm were 40 % too large, 30 % too small, permuted or 1 to 2
+    cm off at random; the fitted ones are within 4 mm, and within 11 mm for 8 microphones on 24 cm.
 
     Parameters
     ----------
     checks : sequence of PositionCheck
-        One a recording, all of one array and one sample rate.
+        One per recording, all of one array and one sample rate.
     usable : ndarray of bool, shape (M,)
-        Channels to fit, 3 to 16; the others stay where they are.
+        Channels to fit, 3 to 16; the others keep their positions.
 
     Returns
     -------
     FittedPositions
-        Of all channels, in the order of the checks' array.
+        Positions of all channels, in the order of the checks' array.
 
     Raises
     ------
     InvalidArgumentError
-        On another number of channels, sample rates that differ, less than two seconds of sound that all
-        microphones hear, sound from one side, or if no positions near those given explain most of it.
+        If the number of channels is outside 3 to 16, the sample rates differ, the coherent sound is shorter
+        than two seconds or comes from one side, or no positions near the given ones explain most of it.
 
     Examples
     --------
@@ -110,15 +112,15 @@ def fit_positions(checks: Sequence[PositionCheck], usable: BoolArray) -> FittedP
     >>> check = PositionCheck(MicrophoneArray(0.05 * np.eye(3)), 16000.0)
     >>> fit_positions([check], np.ones(3, bool))
     Traceback (most recent call last):
-    worldstate.ground.errors.InvalidArgumentError: checks: expected 2 s of sound that all ..., got 0 s
+    worldstate.ground.errors.InvalidArgumentError: checks: expected 2 s of coherent sound, got 0 s
     """
     first, n = checks[0], int(np.count_nonzero(usable))
     heard = [one.heard()[: max(_PARTS // len(checks), 1)] for one in checks]
     parts = sum(map(len, heard))
     _refuse(
-        not 3 <= n <= FEW and f"3 to {FEW} channels that hear one sound, got {n}",
+        not 3 <= n <= FEW and f"3 to {FEW} channels with a common sound, got {n}",
         len({one.sample_rate_hz for one in checks}) > 1 and "one sample rate, got several",
-        parts < LEAST_PARTS and f"2 s of sound that all microphones hear, got {parts / 4:.2g} s",
+        parts < LEAST_PARTS and f"2 s of coherent sound, got {parts / 4:.2g} s",
     )
     step = 2 if parts >= 2 * LEAST_PARTS else 1
     fitted, judged = (first.comparison(usable, np.concatenate(heard)[half::step]) for half in (0, step - 1))
@@ -132,7 +134,7 @@ def fit_positions(checks: Sequence[PositionCheck], usable: BoolArray) -> FittedP
     side = complex(np.exp(1j * judged.azimuths_rad(best)).mean())
     _refuse(
         abs(side) > _ONE_SIDE
-        and f"sound from several sides, got it from {math.degrees(phase(side)):.0f} degrees",
+        and f"sound from several sides, got sound from {math.degrees(phase(side)):.0f} degrees only",
         after < _LEAST_EXPLAINED and f"sound that some positions fit, the best explain {after:.2f} of it",
     )
     unsure = () if step == 2 else ("other sound: there are less than 4 s, which were fitted",)
@@ -145,7 +147,7 @@ def _refuse(*problems: str | Literal[False]) -> None:
 
 
 def _starts(given_m: FloatArray, fitted: Comparison) -> list[FloatArray]:
-    """Return the positions given in the order and the size that fit best, and those by delays alone."""
+    """Return the given positions in the best-fitting order and size, and positions from delays alone."""
     placed = np.empty_like(given_m)
     placed[fitted.best_order()[0]] = given_m
     sized = placed * max(_SIZES, key=lambda size: fitted.explained(size * placed).sum())
@@ -153,16 +155,16 @@ def _starts(given_m: FloatArray, fitted: Comparison) -> list[FloatArray]:
 
 
 def _by_delays(near_m: FloatArray, fitted: Comparison) -> list[FloatArray]:
-    r"""Return positions (m, 3) by the delays of level waves alone, turned to others; none if these show none.
+    r"""Return positions (m, 3) from delays of horizontal waves, rotated to given ones; none if impossible.
 
-    The delays D of all parts have rank two, and the affine rest is that directions have unit length:
+    The delays D of all parts have rank two. The affine factor follows from the unit length of directions:
 
     .. math:: D = U S V^T, \qquad u_s^T B\, u_s = 1, \qquad B = L L^T, \qquad P = c\, V S\, L^{-T}
     """
     longest_s = _LONGEST * float(np.ptp(near_m, axis=0).max()) / SPEED_OF_SOUND_M_S
     delays_s = fitted.delays_s(longest_s)
     plain = np.ones(len(delays_s), bool)
-    for _ in range(_ROUNDS):  # Without the parts in which two sounds or a wall are heard
+    for _ in range(_ROUNDS):  # Excludes parts with two sounds or a reflection
         u, s, v = np.linalg.svd(delays_s[plain], full_matrices=False)
         left = np.linalg.norm(delays_s - delays_s @ v[:2].T @ v[:2], axis=1)
         plain = left <= max(_PLAIN * np.median(left), _FINE * longest_s)
@@ -178,7 +180,7 @@ def _by_delays(near_m: FloatArray, fitted: Comparison) -> list[FloatArray]:
 
 
 def _descent(start_m: FloatArray, fitted: Comparison) -> FloatArray:
-    """Move positions (m, 3) along the axes of their extent to where they explain the most."""
+    """Change positions (m, 3) along the axes of their extent until they explain the most."""
     scale_m = np.ptp(start_m) * (np.ptp(start_m, axis=0) > _FLAT * np.ptp(start_m))
 
     def left(steps: FloatArray) -> float:
@@ -190,7 +192,7 @@ def _descent(start_m: FloatArray, fitted: Comparison) -> FloatArray:
 
 
 def _loose_axes(best_m: FloatArray, judged: Comparison) -> Iterator[str]:
-    """Name the axes along which arrays of another extent explain the sound as well."""
+    """Yield the axes along which arrays of another extent explain the sound equally well."""
     for axis, name in enumerate("xyz"):
         scaled = {scale: best_m * np.where(np.arange(3) == axis, scale, 1.0) for scale in OFF_BY_30}
         alike = [f"{scale:g}" for scale, one in scaled.items() if not judged.is_better(best_m, one)]

@@ -1,6 +1,6 @@
-"""Positions, polarity, delays and clocks of the channels, once a second, by the waves that all hear.
+"""Positions, polarity, delays and clocks of the channels, checked once per second by common waves.
 
-Plane waves from all round say which directions a stream holds, and which order of many channels they fit.
+Plane waves from all directions give the directions of the sound, and the order of many channels that fits.
 """
 
 from collections import deque
@@ -16,23 +16,23 @@ from worldstate.ground.values import NotUsable
 
 from .channel_health import ChannelFault, Fault, faults_where, repeated
 
-# Sound of the own vehicle comes from below and is no fault of a microphone: with level waves alone, swaps
-# were reported in every second recording of a moving ego.
+# Sound of the own vehicle comes from below and is no fault of a microphone: with horizontal waves alone,
+# swaps were reported in half of the recordings of a moving ego.
 _ELEVATIONS_DEG = (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0)
-# A third of the beam of 0.8 m at 1400 Hz.
+# A third of the beam width of a 0.8 m array at 1400 Hz.
 _STEP_DEG = 7.5
-# From here on the source is near, most often the own vehicle, and its wave is no plane one.
+# Steeper sources are near, mostly on the own vehicle, so their waves are not plane.
 _STEEP = np.radians(30.0)
-# Directions whose delays agree to this are one to the array: front and back, or a whole cone.
+# Directions whose delays differ by less are equivalent: front and back, or a whole cone.
 _SAME_S = 2e-6
-# Sharpness of no agreement at all, far below that of one pair in one bin; keeps the logarithm finite.
+# Sharpness without any agreement, far below that of one pair in one bin; keeps the logarithm finite.
 SILENCE = 1e-12
 
 
 class PlaneWaves:
-    """Steering vectors of the directions that microphones (M, 3) can tell apart.
+    """Steering vectors of the directions that microphones (M, 3) can distinguish.
 
-    Shapes: waves_rad (2, D), azimuths and elevations to choose from.
+    Shapes: waves_rad (2, D), azimuths and elevations of candidate directions.
     """
 
     def __init__(self, positions_m: FloatArray, frequencies_hz: FloatArray, waves_rad: FloatArray) -> None:
@@ -43,7 +43,7 @@ class PlaneWaves:
         self.beams: Complex64Array = np.exp(phase).astype(np.complex64)
 
     def agreement(self, coherence: Complex64Array) -> Complex64Array:
-        r"""Agreement of every channel with all others for a wave from every direction, (..., K, M, D).
+        r"""Return the agreement of every channel with all others for every direction, (..., K, M, D).
 
         .. math:: g_{kmd} = \overline{a_{kmd}} \sum_{j \ne m} R_{kmj}\, a_{kjd}
 
@@ -53,7 +53,7 @@ class PlaneWaves:
 
 
 def diffuse_coherence(positions_m: FloatArray, frequencies_hz: FloatArray) -> FloatArray:
-    r"""Coherence of a diffuse field between microphones (M, 3), (K, M, M).
+    r"""Return the coherence of a diffuse field between microphones (M, 3), (K, M, M).
 
     .. math:: \Gamma_{kij} = \frac{\sin(2 \pi f_k d_{ij} / c)}{2 \pi f_k d_{ij} / c}
     """
@@ -62,7 +62,7 @@ def diffuse_coherence(positions_m: FloatArray, frequencies_hz: FloatArray) -> Fl
 
 
 def direction_weights(agreement: Complex64Array) -> Float32Array:
-    r"""Share of every direction in the sound, (D,): the square of its beam power, which sharpens the beams.
+    r"""Return the share of every direction in the sound, (D,): the square of its beam power.
 
     .. math:: w_d \propto \max\Big(\sum_{km} \mathrm{Re}\, g_{kmd},\; 0\Big)^2
     """
@@ -71,7 +71,7 @@ def direction_weights(agreement: Complex64Array) -> Float32Array:
 
 
 def _directions() -> FloatArray:
-    """Azimuths and elevations about one step apart, (2, D), mirrored about the x and y axes alike."""
+    """Return azimuths and elevations about one step apart, (2, D), symmetric about the x and y axes."""
     rows = []
     for elevation in np.radians(_ELEVATIONS_DEG):
         quarter = np.linspace(0.0, np.pi / 2, round(90.0 / _STEP_DEG * np.cos(elevation)) + 1)
@@ -81,40 +81,41 @@ def _directions() -> FloatArray:
     return np.concatenate(rows, axis=1)
 
 
-# Of fewer channels exchanges are not judged here: each microphone is predicted too poorly by its neighbours,
-# and `position_check` tries every exchange in a recording.
+# With fewer channels, exchanges are not checked here: the neighbours of a microphone predict it too poorly,
+# and `position_check` tests every exchange in a recording.
 MAX_CHANNELS = 16
 _ORDER_MEMORY_S = 20
-# Mean gain, nats. Simulated streets: 56 microphones in order below 0.027, though scattering at the roof makes
-# a neighbour's position fit better, and 0.056 and more with two exchanged 8 cm or more apart.
+# Mean gain, nats. With 56 microphones in simulated streets, the gain is below 0.027 in the right order,
+# although scattering at the roof makes a neighbour's position fit better, and 0.056 or more if two
+# microphones 8 cm or more apart are exchanged.
 _GAIN_OF_MANY = 0.04
 
 Pair = tuple[int, int]
 
 
 class OrderCheck:
-    """Compare the order of the channels with those in which two of them are exchanged, second by second."""
+    """Compares the order of the channels with orders in which two are exchanged, once per second."""
 
     def __init__(self, beams: Complex64Array) -> None:
         self._beams = beams
         self._gains: dict[Pair, deque[float]] = {}
 
     def push(self, coherence: Complex64Array, proposed: Iterable[ChannelFault]) -> None:
-        r"""Take the coherence (K, M, M) of one second, its diagonal zero, and the exchanges to be tried.
+        r"""Process the coherence (K, M, M) of one second, with zero diagonal, and the exchanges to test.
 
         .. math:: G_{ab} = \ln \frac{\sum_d \max(P_d^{(ab)}, 0)^2}{\sum_d \max(P_d, 0)^2}
         """
         exchanges = ((one.channel, one.looks_like) for one in proposed if one.looks_like is not None)
         pairs = tuple({(min(pair), max(pair)) for pair in exchanges})
         gains = sharpness_gains(coherence, self._beams, np.array(pairs, int)) if pairs else np.zeros(0)
-        # An exchange that is no longer proposed is forgotten.
+        # Exchanges that are no longer proposed are deleted.
         before, self._gains = self._gains, {}
         for pair, gain in zip(pairs, gains.tolist(), strict=True):
             self._gains[pair] = before.get(pair, deque(maxlen=_ORDER_MEMORY_S))
             self._gains[pair].append(gain)
 
     def faults(self) -> list[ChannelFault]:
-        """Return the channels whose exchange makes the waves sharper."""
+        """Return the channels whose exchange makes the beams sharper."""
         means = sorted((float(np.mean(gains)), pair) for pair, gains in self._gains.items())
         return [
             ChannelFault(one, Fault.SWAPPED, gain, looks_like=other)
@@ -125,7 +126,7 @@ class OrderCheck:
 
 
 def sharpness_gains(coherence: Complex64Array, beams: Complex64Array, pairs: IndexArray) -> FloatArray:
-    r"""Gain in the sharpness of the beams by exchanging two channels, nats, (P,).
+    r"""Return the gain in the sharpness of the beams from the exchange of two channels, nats, (P,).
 
     .. math:: P_d = \sum_{k,\, m < j} \mathrm{Re}\, \overline{a_{kmd}} R_{kmj} a_{kjd}
 
@@ -138,7 +139,7 @@ def sharpness_gains(coherence: Complex64Array, beams: Complex64Array, pairs: Ind
     at_a, at_b, between = beams[:, a], beams[:, b], coherence[:, a, b, None]
     usual = (at_a.conj() * between * at_b).real.sum(axis=0)
     crossed = (at_b.conj() * between * at_a).real.sum(axis=0)
-    # Each in the other's position, all others in their own; the pair itself is in both sums.
+    # The two channels exchange positions, all others keep theirs; the pair itself is in both sums.
     placed = (at_b.conj() * heard[:, a] + at_a.conj() * heard[:, b]).real.sum(axis=0)
     exchanged = power - own[a] - own[b] + usual + placed - 2.0 * between.real.sum(axis=0) + crossed
     sharp = np.square(np.maximum(exchanged, 0.0)).sum(axis=1, dtype=np.float64)
@@ -151,15 +152,15 @@ _FLAT = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Card:
-    """Consecutive channels, such as those of one sound card, and the amount by which they differ."""
+    """Consecutive channels, such as those of one sound card, and the value by which they differ."""
 
     channels: BoolArray  # shape (M,)
     amount: float
-    sensitivity: float  # Length of its pattern, of which a tilt of all waves explains nothing
+    sensitivity: float  # Length of the part of its pattern that a tilt of all waves does not explain
 
 
 def untilted(positions_m: FloatArray, known: BoolArray) -> FloatArray:
-    r"""Return the matrix that takes from values of channels what another direction of sound explains.
+    r"""Return the projection that removes a tilt of all waves, i.e. another direction, from channel values.
 
     .. math:: Q = I - X (X^T X)^+ X^T, \qquad X = [1, p]
 
@@ -175,7 +176,7 @@ def untilted(positions_m: FloatArray, known: BoolArray) -> FloatArray:
 
 
 def runs(n_channels: int) -> FloatArray:
-    """All runs of consecutive channels up to half of them, (R, M) of ones and zeros.
+    """Return all runs of consecutive channels up to half of them, (R, M), as ones and zeros.
 
     Examples
     --------
@@ -188,7 +189,7 @@ def runs(n_channels: int) -> FloatArray:
     found = [
         (index >= first) & (index < first + length)
         for length in range(1, n_channels // 2 + 1)
-        # Of two halves only the later one: that the others differ from it is the same.
+        # Of two halves only the second, because a difference of the first is equivalent.
         for first in range(n_channels // 2 if 2 * length == n_channels else 0, n_channels - length + 1)
     ]
     return np.asarray(found, np.float64)
@@ -196,7 +197,7 @@ def runs(n_channels: int) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _untilted_runs(positions_m: bytes, known: bytes) -> tuple[FloatArray, FloatArray]:
-    """Return the matrix of `untilted`, and what of every run no tilt explains: half a millisecond of 56."""
+    """Return the matrix of `untilted` and the power of every run after it; cached, 0.5 ms for 56 channels."""
     free = untilted(np.frombuffer(positions_m).reshape(-1, 3), np.frombuffer(known, bool))
     candidates = runs(len(free))
     return free, np.add.reduce(candidates @ free * candidates, 1)
@@ -209,51 +210,53 @@ def best_card(values: FloatArray, power: FloatArray, candidates: FloatArray) -> 
 
     Shapes: values (M,), power (R,), c^T Q c of the candidates (R, M).
     """
-    # A pattern that a tilt explains but for a twentieth would turn any noise into a large amount.
+    # A tilt that explains all but a twentieth of a pattern would turn noise into a large value.
     power = np.where(power > 0.05 * candidates.sum(axis=1), power, np.inf)
     found = candidates @ values
     best = int((found**2 / power).argmax())
     return Card(candidates[best] > 0.0, float(found[best] / power[best]), float(np.sqrt(power[best])))
 
 
-# Delays searched in one second, beyond those known from the seconds before: half a period of 700 Hz.
+# Delays tested in one second, added to those of the seconds before: half a period of 700 Hz.
 _SEARCH_S = np.arange(-8e-4, 8.01e-4, 2e-5)
-# Seconds remembered, and the fewest with a verdict on delays and on drifts.
+# Duration of the memory, and the least durations for a result on delays and on drifts.
 _MEMORY_S, _MIN_DELAY_S, _MIN_DRIFT_S = 30, 6, 8
-# Share of the median channel's agreement below which a channel's delay means nothing.
+# Agreement relative to the median channel below which the delay of a channel is meaningless.
 _GOOD = 0.3
-# Share of the seconds in which a channel must be good.
+# Share of the seconds in which a channel must be usable.
 _MOSTLY = 0.7
-# More of the sound than this from steeply above or below: the own vehicle, whose near sources have delays
-# of up to 0.15 ms that no plane wave has. They are steady, so that drifts can still be judged; among many
-# channels the pattern of a card is three times as long as theirs.
+# Limit for the share of sound from steep directions: the own vehicle. Its near sources have delays of up to
+# 0.15 ms that no plane wave has. They are constant, so drifts can still be checked; with many channels the
+# pattern of a card is three times as long as theirs.
 _NEAR = 0.5
-# Fewer free delays than this, and any scatter looks like a card.
+# With fewer free delays, any variation looks like a card.
 _MIN_FREEDOM = 3.0
-# Least delay of a card and of one channel, and least length of its pattern over the root of the number of
-# channels. Scattering at the roof delays a vehicle's sound by 0.1 ms at random. Simulated streets, 8
-# microphones, 10 s: lengths of 0.135 ms and more with a card 0.3 ms late, of 0.14 ms at most and mostly below
-# 0.09 ms without.
+# Least delay of a card and of one channel, and least length of its pattern divided by the root of the number
+# of channels. Scattering at the roof delays a vehicle's sound by 0.1 ms at random. In simulated streets (8
+# microphones, 10 s), the length is 0.135 ms or more with a card 0.3 ms late; without one it is mostly below
+# 0.09 ms and at most 0.14 ms.
 _DELAY_S, _LONE_DELAY_S, _DELAY_RMS_S = 1.5e-4, 4e-4, 4.6e-5
-# Least drift, 20 millionths, and least length of its pattern over twenty seconds. A passing vehicle, whose
-# sound is scattered by the roof, looks like a drift for some seconds: the error falls as the time to the 3/2.
+# Least drift, 20 parts per million, and least length of its pattern over twenty seconds. The sound of a
+# passing vehicle, scattered at the roof, looks like a drift for some seconds; the error falls with time to
+# the power 3/2.
 _DRIFT, _DRIFT_LENGTH, _DRIFT_SPAN_S = 2e-5, 2e-5, 20.0
-# Streams of 8 microphones: 11 where a siren passes a healthy array, 17 and more within 30 s at 50 millionths.
+# Streams of 8 microphones: 11 if a siren passes a healthy array, 17 or more within 30 s at 50 parts per
+# million.
 _SIGMAS = 12.0
-# Small arrays are compared in several rounds a second; the beams of large ones hardly change by one card.
+# Small arrays have several rounds per second; in large ones a single card hardly changes the beams.
 _ROUNDS = 3
 
 
 class DelayCheck:
-    r"""Follow the delay of every channel, second by second.
+    r"""Estimate the delay of every channel, once per second.
 
-    Sharp beams show where the sound comes from. Each channel is then turned until it agrees best with all
+    Sharp beams give the direction of the sound. Each channel is then shifted until it agrees best with all
     others in these beams,
 
     .. math:: \hat\tau_m = \arg\max_\tau \sum_k \mathrm{Re}\, e^{j \omega_k \tau} \sum_d w_d\, g_{kmd}
 
-    and what a tilt of all waves explains is taken out, because another direction of the sound would give it,
-    too. Repeated with the turned channels this is the self-calibration of radio astronomy.
+    and the part that a tilt of all waves explains is removed, because another direction of the sound also
+    causes it. The repetition with shifted channels is the self-calibration of radio astronomy.
 
     References
     ----------
@@ -269,14 +272,14 @@ class DelayCheck:
         self._search = np.exp(1j * self._omega[:, None] * _SEARCH_S)
         self._delays = np.zeros(n)
         self._runs = runs(n)
-        # A clock drives two channels at least; one alone that moves is one that stands elsewhere.
+        # A clock drives at least two channels; a single channel with a drift has another position.
         self._is_card = self._runs.sum(axis=1) > 1.0
         self._rounds = _ROUNDS if n <= MAX_CHANNELS else 1
         self._values: deque[FloatArray] = deque(maxlen=_MEMORY_S)
         self._far: deque[bool] = deque(maxlen=_MEMORY_S)
 
     def push(self, coherence: Complex64Array, active: BoolArray) -> None:
-        r"""Take the coherence (K, M, M) of one second, its diagonal zero, and the active channels (M,).
+        r"""Process the coherence (K, M, M) of one second, with zero diagonal, and the active channels (M,).
 
         .. math:: \hat\tau \leftarrow Q (\hat\tau + \Delta\tau)
         """
@@ -298,12 +301,12 @@ class DelayCheck:
         return np.asarray(np.isnan(latest).all(axis=0)) if latest else np.ones(len(self._delays), bool)
 
     def _peaks(self, agreement: Complex64Array, active: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Return the delay at which every channel agrees best, (M,), and the channels that agree with any."""
+        """Return the delay of best agreement for every channel, (M,), and the channels that agree at all."""
         table = (agreement.T @ self._search).real
         at = np.clip(table.argmax(axis=1), 1, len(_SEARCH_S) - 2)
         rows = np.arange(len(at))
         before, peak, after = (table[rows, at + step] for step in (-1, 0, 1))
-        # A channel that agrees with nothing has no bend.
+        # A channel without agreement has no curvature.
         bend = np.minimum(before - 2.0 * peak + after, -1e-12)
         step = _SEARCH_S[1] - _SEARCH_S[0]
         moved = _SEARCH_S[at] + step * np.clip(0.5 * (before - after) / bend, -1.0, 1.0)
@@ -311,7 +314,7 @@ class DelayCheck:
         return np.where(good, moved, 0.0), good
 
     def faults(self) -> list[ChannelFault]:
-        """Return the channels of a card that drifts, or else those of one that is late."""
+        """Return the channels of a card that drifts; if none drifts, those of a card that is late."""
         if not self._values:
             return []
         values = np.array(self._values)
@@ -364,14 +367,14 @@ def _named(card: Card, fault: Fault, std: float) -> list[ChannelFault]:
     return [ChannelFault(channel, fault, card.amount, std=std) for channel in channels]
 
 
-# Incoherent power of a usable channel against the field's: delay mismatch and self-noise of real arrays.
+# Incoherent power of a usable channel relative to the field: delay mismatch and self-noise of real arrays.
 _NOISE = 0.2
-# The same for a channel that is not used to predict others: its weight becomes negligible.
+# The same for a channel that does not predict others: its weight becomes negligible.
 _UNUSABLE = 1e3
 
 
 def position_weights(array: MicrophoneArray, frequencies_hz: FloatArray, usable: BoolArray) -> Float32Array:
-    r"""Weights of all other microphones in the prediction at every position.
+    r"""Return the weights of all other microphones in the prediction at every position.
 
     .. math:: w_{pj} = -\frac{(\Gamma + \Lambda)^{-1}_{pj}}{(\Gamma + \Lambda)^{-1}_{pp}}, \qquad
               \Gamma_{ij} = \frac{\sin(k d_{ij})}{k d_{ij}}
@@ -386,7 +389,7 @@ def position_weights(array: MicrophoneArray, frequencies_hz: FloatArray, usable:
 
 
 def position_scores(coherence: Float32Array, weights: Float32Array) -> FloatArray:
-    r"""Score every channel at every position, between -1 and 1.
+    r"""Return the score of every channel at every position, between -1 and 1.
 
     .. math:: S_{mp} = \frac{\sum_k \sum_{j \ne m} w_{k,pj} R_{k,jm}}
               {\sqrt{K \sum_k w_{k,p}^T R_k\, w_{k,p}}}
@@ -395,7 +398,7 @@ def position_scores(coherence: Float32Array, weights: Float32Array) -> FloatArra
     """
     predicted = weights @ coherence
     power = (predicted * weights).sum(axis=(0, 2), dtype=np.float64)
-    # A channel that took part in the prediction would agree with itself.
+    # Without this, a channel that contributed to the prediction would agree with itself.
     predicted -= np.einsum("kmm->km", coherence)[:, None, :] * weights
     agreement = predicted.sum(axis=0, dtype=np.float64).T
     return np.asarray(agreement / np.sqrt(np.maximum(power, np.finfo(np.float32).tiny) * len(coherence)))
@@ -403,39 +406,39 @@ def position_scores(coherence: Float32Array, weights: Float32Array) -> FloatArra
 
 # A mean over the last two seconds.
 _FORGET = 1.0 - 1.0 / 20.0
-# Median coherence below which there is no verdict: chance alone gives 0.02 in two seconds.
+# Median coherence below which there is no result: chance alone gives 0.02 in two seconds.
 _MIN_COHERENCE = 0.15
-# Shares of the median coherence at which a channel becomes suspect, and well again. Simulated streets:
-# healthy ones above 0.59, incoherent ones below 0.07.
+# Coherence relative to the median at which a channel becomes suspect and recovers. In simulated streets,
+# healthy channels are above 0.59 and incoherent ones below 0.07.
 _SUSPECT, _WELL = 0.3, 0.45
-# Least gain at another position. Simulated streets: a correct position loses by 0.18 at most, swapped
-# channels 9 cm or more apart across the road gain 0.25 to 0.75.
+# Least gain at another position. In simulated streets, a channel at its correct position gains at most 0.18
+# elsewhere; swapped channels that are 9 cm or more apart across the road gain 0.25 to 0.75.
 _MARGIN = 0.3
-# Channels that may be reassigned gain at least the first somewhere; a swap is reported only if the channel
-# whose position is taken gains at least the second by leaving it.
+# Channels that may be reassigned have the first gain at some position. A swap is reported only if the channel
+# whose position is taken has at least the second gain elsewhere.
 _CANDIDATE_GAIN = 0.2
 _PARTNER_MARGIN = 0.1
 
 
 class PositionFit:
-    r"""Compare every channel with every position; a fault needs two verdicts in a row.
+    r"""Compares every channel with every position; a fault requires two consecutive detections.
 
-    In any field of plane waves the sound at one position follows from that at the positions around it. The
-    best linear prediction in a diffuse field, whose coherence over a distance d is sin(kd) / (kd), from all
-    other microphones is
+    In any field of plane waves, the sound at one position follows from that at the surrounding positions. The
+    best linear prediction from all other microphones in a diffuse field, whose coherence over a distance d is
+    sin(kd) / (kd), is
 
     .. math:: \hat x_p = -\sum_{j \ne p} \frac{(\Gamma + \Lambda)^{-1}_{pj}}{(\Gamma + \Lambda)^{-1}_{pp}}\,
               x_j
 
-    and the score of channel m at position p is the coherence of x_m with that prediction, m itself left out,
+    and the score of channel m at position p is the coherence of x_m with that prediction without m,
 
     .. math:: S_{mp} = \frac{\sum_k \mathrm{Re}\, E[x_{k,m} \overline{\hat x_{k,p}}]}
                             {\sqrt{K \sum_k E|\hat x_{k,p}|^2}}
 
-    over K bins of whitened spectra. A usable channel fits its own position best, an incoherent one fits none,
-    one with crossed leads fits with the opposite sign, one in the wrong socket fits another position.
-    Microphones that differ only in a direction in which no wave travels cannot be distinguished, and need not
-    be.
+    over K bins of whitened spectra. A usable channel fits its own position best, and an incoherent one fits
+    none. A channel with reversed polarity fits with the opposite sign, and a channel on the wrong input fits
+    another position. Microphones that differ only along a direction without waves cannot be distinguished,
+    and need not be.
 
     References
     ----------
@@ -457,7 +460,7 @@ class PositionFit:
         self.faults: list[ChannelFault] = []  # Noisy, inverted and swapped channels
 
     def add(self, matrices: Complex64Array, n_frames: int) -> None:
-        r"""Take the cross-spectra (K, M, M) of one hop, summed over its frames.
+        r"""Add the cross-spectra (K, M, M) of one hop, summed over its frames.
 
         .. math:: S_{ij} \leftarrow 0.95\, S_{ij} + \mathrm{Re} \sum_t Z_i \overline{Z_j}, \qquad
                   n \leftarrow 0.95\, n + T
@@ -467,7 +470,7 @@ class PositionFit:
         self._n_frames = _FORGET * self._n_frames + n_frames
 
     def evaluate(self, active: BoolArray) -> None:
-        """Look for faults among the active channels, (M,)."""
+        """Search for faults among the active channels, (M,)."""
         self._use(active & ~self._suspects)
         scores = position_scores(self._sum / np.float32(self._n_frames), self._weights)
         typical = float(np.median(scores.diagonal()[self._usable])) if self._usable.any() else 0.0
@@ -477,7 +480,7 @@ class PositionFit:
         self.faults, self._found = repeated(found, self._found)
 
     def _use(self, usable: BoolArray) -> None:
-        """Predict from these channels only; new weights take a few milliseconds, so they are kept."""
+        """Predict from these channels only; the weights are stored because they take a few milliseconds."""
         if not np.array_equal(usable, self._usable):
             self._usable = usable
             self._weights = position_weights(*self._geometry, usable)
@@ -496,19 +499,19 @@ class PositionFit:
 
 
 def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
-    r"""Assign channels to positions so that the total score is largest; list those that gain by it.
+    r"""Assign channels to positions with the largest total score; return the channels that gain.
 
     .. math:: \hat\pi = \arg\max_\pi \sum_m S_{m, \pi(m)}, \qquad g_m = S_{m, \hat\pi(m)} - S_{mm}
 
     Shapes: scores (M, M), candidates (M,).
     """
-    # The Hungarian method over the channels that fit elsewhere better. The others stay, so that a swap does
-    # not displace a third channel to its second-best position.
+    # Hungarian method over the channels that fit better elsewhere. The others keep their positions, so that a
+    # swap does not move a third channel to its second-best position.
     movable_mask = scores.max(axis=1) - scores.diagonal() > _CANDIDATE_GAIN
     movable = np.flatnonzero(candidates & movable_mask)
     if len(movable) < 2:
         return []
-    # Imported where it is needed: few arrays have exchanged channels.
+    # Imported here because few arrays have exchanged channels.
     from scipy.optimize import linear_sum_assignment
 
     table = scores[np.ix_(movable, movable)]
@@ -516,7 +519,7 @@ def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
     gain = table[np.arange(len(movable)), best] - table.diagonal()
     leaves = gain > _PARTNER_MARGIN
     found = (gain > _MARGIN) & leaves[best]
-    # In a swap of two, one certain channel implies the other.
+    # In a swap of two channels, certainty about one implies the other.
     found |= (best[best] == np.arange(len(movable))) & found[best] & leaves
     return [
         ChannelFault(int(movable[i]), Fault.SWAPPED, float(gain[i]), looks_like=int(movable[best[i]]))
@@ -525,18 +528,18 @@ def displaced(scores: FloatArray, candidates: BoolArray) -> list[ChannelFault]:
 
 
 _EVERY_HOPS = 10
-# Below, the waves are too long to compare channels by, and wind covers them.
+# Below this frequency, waves are too long to compare channels, and wind noise is stronger.
 _LOWEST_HZ = 250.0
-# Bins used, for small and for large arrays: more bins or more pairs, the cost of a second stays some 5 ms.
+# Number of bins for large and for small arrays, so that the computing time per second remains about 5 ms.
 _FEW_BINS, _MANY_BINS = 7, 14
 _TINY = np.finfo(np.float32).tiny
 
 
 class GeometryCheck:
-    """Compare all channels with the positions that they are said to have; most faults need two verdicts."""
+    """Compares all channels with their stated positions; most faults require two consecutive detections."""
 
-    # The position fit compares each channel with its neighbours: it finds noisy and inverted channels and, in
-    # a large array, proposes exchanges. Plane waves over the whole array decide on them and find delays.
+    # The position fit compares each channel with its neighbours. It finds noisy and inverted channels and, in
+    # a large array, proposes exchanges. Plane waves over the whole array confirm these and give delays.
 
     def __init__(self, array: MicrophoneArray, frequencies_hz: FloatArray) -> None:
         n = array.n_microphones
@@ -551,7 +554,7 @@ class GeometryCheck:
         self._hops, self._n_frames = 0, 0
         self._late: list[ChannelFault] = []
         self._by_waves: list[ChannelFault] = []
-        self.faults: list[ChannelFault] = []  # One a channel, the more specific one
+        self.faults: list[ChannelFault] = []  # One per channel, the more specific one
 
     @property
     def coherence(self) -> float | NotUsable:
@@ -559,7 +562,7 @@ class GeometryCheck:
         return self._fit.coherence
 
     def push(self, matrices: Complex64Array, n_frames: int, active: BoolArray) -> None:
-        r"""Take the cross-spectra (K, M, M) of one hop, summed over its frames, and the active channels (M,).
+        r"""Add the cross-spectra (K, M, M) of one hop, summed over frames, and the active channels (M,).
 
         .. math:: R_{ij} = \frac{1}{T} \sum_t Z_i \overline{Z_j}
         """
@@ -584,11 +587,12 @@ class GeometryCheck:
         many = len(active) > MAX_CHANNELS
         self._order.push(coherence, [one for one in self._fit.faults if many and one.fault is Fault.SWAPPED])
         confirmed, self._late = repeated(self._delay.faults(), self._late)
-        # Exchanged channels are late, too.
+        # Exchanged channels also look late.
         self._by_waves = self._order.faults() or confirmed
 
     def _most_specific(self) -> list[ChannelFault]:
-        # Microphones half a metre apart hardly predict each other: noisy is what no wave agrees with, either.
+        # Microphones half a metre apart hardly predict each other, so a noisy channel must also match no
+        # wave.
         incoherent = self._delay.incoherent
         inverted = [one for one in self._fit.faults if one.fault is Fault.INVERTED]
         noisy = [one for one in self._fit.faults if one.fault is Fault.NOISY and incoherent[one.channel]]

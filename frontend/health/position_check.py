@@ -1,14 +1,14 @@
-r"""Compare the positions that an array is said to have with its sound: order, size and mounting.
+r"""Comparison of an array's stated positions with its sound: order, size and mounting.
 
-Sound that comes mostly from one direction u within a quarter of a second has, in a narrow band k, the
-coherence
+If the sound of a quarter of a second comes mostly from one direction u, its coherence in a narrow band k is
 
 .. math:: R_{kij} = w_k\, a_{ki}(u)\, \overline{a_{kj}(u)}
           + v_k\, \frac{\sin(2 \pi f_k d_{ij} / c)}{2 \pi f_k d_{ij} / c}, \qquad w_k, v_k \ge 0,
 
-that of a plane wave over a diffuse field. Positions are judged by what this explains of :math:`|R|^2` by
-least squares with the best u near the horizon: no other order of the channels and no other size of the array
-may explain more. As every hypothesis hears the same sound, neither the room nor the sources need be known.
+the sum of a plane wave and a diffuse field. A hypothesis about the positions is evaluated by the part of
+:math:`|R|^2` that this explains, by least squares with the best u near the horizon. The positions are
+accepted if no other order of the channels and no other size of the array explains more. All hypotheses use
+the same sound, so neither the room nor the sources need to be known.
 
 References
 ----------
@@ -30,46 +30,48 @@ from worldstate.ground.values import wrap_angle
 
 from .geometry_check import PlaneWaves, diffuse_coherence
 
-# A frame, and a part of the sound in which one source dominates: a syllable of speech.
+# Duration of a frame, and of a part in which one source dominates: a syllable of speech.
 _FRAME_S, _PART_S = 0.032, 0.25
-# Up to here every exchange of two channels is tried. One hypothesis of 56 channels takes half a second.
+# Largest number of channels for which every exchange of two is tested; one test of 56 takes half a second.
 FEW = 16
-# Parts kept, those with the most coherent sound; bands times channels, the fewest and the most bands.
+# Number of parts kept, those with the most coherent sound; bands times channels; fewest and most bands.
 _PARTS, _BANDS, _FEWEST, _MOST = 60, 192, 10, 24
-# Delays that are tried between two channels: at 16 kHz and 10 cm about a third of a sample apart.
+# Number of tested delays between two channels: at 16 kHz and 10 cm about a third of a sample apart.
 _DELAYS = 201
-# Two seconds: below, one word decides.
+# Two seconds: in less, a single word would determine the result.
 LEAST_PARTS = 8
-# From waves of eight spacings, whose phases begin to differ, to those that alias a little; an array whose
-# numbers are inches is judged by waves that a smaller one hears, too.
+# From wavelengths of eight spacings, whose phases begin to differ, to wavelengths with slight aliasing. The
+# limits in Hz also suit a smaller array, in case the positions are in inches.
 _BAND, _LEAST_TOP_HZ, _BOTTOM_HZ = (0.25, 1.5), 2000.0, (200.0, 1000.0)
-# Within a band whose width is the speed of sound over so many extents of the array phases hardly turn.
+# In a band with a width of the speed of sound over this many extents of the array, phases hardly change.
 _EXTENTS = 16.0
-# Near the horizon: steep waves look to a flat array as level ones do to a smaller one.
+# Near the horizon: for a flat array, steep waves look like horizontal waves at a smaller array.
 _ELEVATIONS_RAD = np.radians([0.0, 13.0, -13.0, 26.0, -26.0])
-# From ahead on, so that of two directions that an array hears alike the one ahead is kept.
+# Starting from ahead, so that of two equivalent directions the one ahead is kept.
 _AZIMUTHS_RAD = np.radians(sorted(range(-180, 180, 5), key=abs))
 _WAVES_RAD = np.array(np.meshgrid(_AZIMUTHS_RAD, _ELEVATIONS_RAD)).reshape(2, -1)
-# Within an eighth of its size an array is called right: sources above its plane make it seem smaller.
+# Sizes within 9 % are accepted: sources above the plane of an array make it seem smaller.
 _RIGHT = (1.0, 0.92, 1.09)
 _OFF = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0, 10.0, 25.4, 39.37, 1 / 10, 1 / 25.4, 1 / 39.37)
-# Least gain of another order and of another size in the logarithm of what is left unexplained, and in
-# standard deviations. Simulated rooms: right orders lose by 0.5 and more, right sizes by 0.09 (rings of 4)
-# and 0.01 (56 microphones, of which one direction explains a tenth); wrong sizes gain by 0.02 and more.
+# Least gain of another order and of another size, in the logarithm of the unexplained part, and in standard
+# deviations. In simulated rooms, other orders than the right one lose 0.5 or more, and other sizes 0.09
+# (rings of 4) and 0.01 (56 microphones, with one direction explaining a tenth); wrong sizes gain 0.02 or
+# more.
 _ORDER_GAIN, SIZE_GAIN, _SIGMAS = 0.05, 0.015, 4.0
-# Mean square of the coherence below which there is no sound that all microphones hear.
+# Mean square of the coherence below which the microphones have no common sound.
 _COHERENT = 0.02
-# Of four microphones every order is few exchanges away.
+# With four microphones every order is a few exchanges away from the right one.
 _RANDOM_ORDERS, _LEAST_BY_CHANCE, _MOSTLY = 3, 4, 0.6
-# Sizes that a sound must exclude before the one claimed is called right.
+# Sizes that the sound must exclude before the stated size is confirmed.
 OFF_BY_30 = (0.77, 1.3)
-# Least share of the coherent energy that is counted as unexplained, and distance over the extent of the array
-# within which two microphones count as in one place.
+# Smallest unexplained share of the coherent energy, and the distance relative to the array's extent below
+# which two microphones are considered to be at one place.
 _LEAST_LEFT, _SAME_PLACE = 0.02, 0.05
-# One wave: what one direction explains, and the share of parts that come from it. 56 microphones, simulated:
-# in rooms .2 to .6, single sources in the open .64 and more, and nine tenths of their parts within 5 degrees.
+# Single wave: least share that one direction explains, and least share of the parts from it. With 56
+# simulated microphones, one direction explains 0.2 to 0.6 in rooms and 0.64 or more of single sources in the
+# open, and nine tenths of their parts are within 5 degrees.
 _DIRECT, _PARTS_OF_ONE = 0.5, 0.8
-# Of one sound from a known side: error of its bearing, and difference at which two mountings fit alike.
+# For sound from a known side: error of the bearing, and the difference below which two mountings fit equally.
 _SIDE_RAD = math.radians(15.0)
 _ALIKE_RAD = math.radians(7.0)
 
@@ -77,7 +79,7 @@ NO_SIDE = ("whether the array is mirrored or turned: only sound from a known sid
 
 
 class Hypothesis:
-    """What plane waves and a diffuse field explain, for positions (M, 3) and frequencies (K,)."""
+    """Energy that plane waves and a diffuse field explain, for positions (M, 3) and frequencies (K,)."""
 
     def __init__(self, positions_m: FloatArray, frequencies_hz: FloatArray) -> None:
         self.waves = PlaneWaves(positions_m, frequencies_hz, _WAVES_RAD)
@@ -91,7 +93,7 @@ class Hypothesis:
         return np.asarray(self.waves.agreement(coherence).real.sum(axis=-2) / self._pairs)
 
     def explained(self, coherence: Complex64Array) -> FloatArray:
-        """Energy explained by a wave from each direction, (S, D), in parts of coherence (S, K, M, M)."""
+        """Return the energy explained by a wave from each direction, (S, D), for coherence (S, K, M, M)."""
         wave = self._on_beams(coherence)
         field = ((coherence.real * self._diffuse).sum(axis=(2, 3)) / self._pairs)[:, :, None]
         w, v = wave * self._power - field * self._shared, field - wave * self._shared
@@ -102,26 +104,25 @@ class Hypothesis:
         return np.asarray(np.where(mixed, both, one).sum(axis=1))
 
     def best(self, coherence: Complex64Array) -> FloatArray:
-        """Energy that the best direction of every part explains, (S,)."""
+        """Return the energy that the best direction of every part explains, (S,)."""
         return np.asarray(self.explained(coherence).max(axis=1))
 
 
 @dataclass(frozen=True, slots=True)
 class PositionVerdict:
-    """What the sound of a recording says about the positions of the microphones.
+    """Result of the comparison of a recording's sound with the positions of the microphones.
 
     Parameters
     ----------
     order : tuple of int or None
-        Place of every channel, from 0, in the order that fits better; empty where no single one was found.
-        None where the order fits, or is not judged.
+        Place of every channel, from 0, in an order that fits better; empty if all orders fit equally badly.
+        None if the order fits or is undetermined.
     size : float or None
-        Factor to the positions that fits better; None where the size fits, or is not judged.
+        Factor on the positions that fits better; None if the size fits or is undetermined.
     mounting : tuple of str
-        How an array is mounted that hears a sound of a known side elsewhere; more than one where it cannot
-        be told which.
+        Possible mountings that explain a wrong bearing of a sound from a known side.
     unjudged : tuple of str
-        What this sound does not show, and why.
+        Properties that this sound does not determine, with reasons.
 
     Examples
     --------
@@ -136,7 +137,7 @@ class PositionVerdict:
 
     @property
     def fits(self) -> bool:
-        """Whether nothing speaks against the positions."""
+        """Whether the sound agrees with the positions as far as it determines them."""
         return self.order is None and self.size is None and not self.mounting
 
 
@@ -144,7 +145,7 @@ NOTHING_AGAINST = PositionVerdict()
 
 
 class PositionCheck:
-    """Collect the coherence of a recording by quarters of a second, and judge the positions by it."""
+    """Collects the coherence of a recording in quarters of a second and checks the positions with it."""
 
     def __init__(self, array: MicrophoneArray, sample_rate_hz: float) -> None:
         n = array.n_microphones
@@ -160,13 +161,13 @@ class PositionCheck:
         self._bands = first[:, None] + np.arange(wide)
         self._frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
         self._frames_a_part = round(2.0 * _PART_S * sample_rate_hz / nfft)
-        # What independent noise reaches by chance.
+        # Mean square of independent noise by chance.
         self._noise = 1.0 / (self._frames_a_part * wide)
         self._stft = StreamingStft(n, nfft, bins)
         self._parts: list[tuple[float, Complex64Array]] = []
 
     def push(self, samples: Float32Array) -> None:
-        r"""Take the next samples (n, M), best a second of them, and keep the coherence of their parts.
+        r"""Process the next samples (n, M), ideally one second, and store the coherence of their parts.
 
         .. math:: R_{kij} = \frac1{TB} \sum_{t, b \in k} \frac{X_{tbi} \overline{X_{tbj}}}{|X_{tbi} X_{tbj}|}
         """
@@ -184,34 +185,34 @@ class PositionCheck:
         return sorted(self._parts, key=lambda one: -one[0])[:_PARTS]
 
     def heard(self) -> Complex64Array:
-        """Coherence (S, K, M, M) of the parts with the most sound that all microphones hear."""
+        """Return the coherence (S, K, M, M) of the parts with the most common sound."""
         kept = [coherence for power, coherence in self._strongest() if power > _COHERENT]
         shape = len(self._frequencies), len(self.positions_m), len(self.positions_m)
         return np.asarray(kept, np.complex64).reshape(-1, *shape)
 
     def comparison(self, usable: BoolArray, heard: Complex64Array) -> "Comparison":
-        """Return what hypotheses about the usable channels (M,) are compared by, on parts that were heard."""
+        """Return the comparison of hypotheses for the usable channels (M,), from parts of `heard`."""
         return Comparison(self.positions_m, self._frequencies, np.flatnonzero(usable), heard, self._noise)
 
     def verdict(self, usable: BoolArray, heard_from_rad: float | None = None) -> PositionVerdict:
-        """Judge order and size of the usable channels (M,), by a sound of known azimuth their mounting."""
+        """Check order and size of the usable channels (M,), and the mounting with sound of known azimuth."""
         heard = self.heard()
         if np.count_nonzero(usable) < 3:
             return PositionVerdict(unjudged=("order and size: three usable microphones are needed",))
         if len(heard) < LEAST_PARTS:
-            few = f"{_PART_S * len(heard):.2g} s of sound that all microphones hear, 2 s are needed"
+            few = f"{_PART_S * len(heard):.2g} s of coherent sound, 2 s are needed"
             return PositionVerdict(unjudged=(f"order and size: {few}",))
         return self.comparison(usable, heard).verdict(heard_from_rad)
 
 
 def _power(coherence: Complex64Array) -> float:
-    """Mean square over the pairs of coherence (..., M, M), its diagonal zero."""
+    """Return the mean square over the pairs of coherence (..., M, M), whose diagonal is zero."""
     n = coherence.shape[-1]
     return float(np.square(np.abs(coherence)).mean() * n / (n - 1))
 
 
 class Comparison:
-    """Hypotheses about some of the channels, (m,), that hear the same parts, coherence (S, K, M, M)."""
+    """Comparison of hypotheses for some channels, (m,), on the same parts, coherence (S, K, M, M)."""
 
     def __init__(
         self,
@@ -228,11 +229,11 @@ class Comparison:
         self._claimed = Hypothesis(self._positions, frequencies_hz)
 
     def explained(self, positions_m: FloatArray) -> FloatArray:
-        """Share of the coherent energy of all parts that positions (m, 3) explain in each, (S,)."""
+        """Return the share of the total coherent energy that positions (m, 3) explain in each part, (S,)."""
         return np.asarray(Hypothesis(positions_m, self._frequencies).best(self._coherence) / self._power)
 
     def delays_s(self, longest_s: float) -> FloatArray:
-        """Delay of every channel against their mean in each part, (S, m), at most so long between two."""
+        """Return the delay of every channel relative to their mean, (S, m), with a limit between two."""
         grid_s = np.linspace(-longest_s, longest_s, _DELAYS)
         turns = np.exp(2j * np.pi * self._frequencies[:, None] * grid_s)
         by_pair = self._coherence.reshape(*self._coherence.shape[:2], -1)
@@ -241,16 +242,16 @@ class Comparison:
         return np.asarray((pairs - pairs.mT).mean(axis=2) / 2.0)
 
     def azimuths_rad(self, positions_m: FloatArray) -> FloatArray:
-        """Azimuth that explains the most of each part with positions (m, 3), (S,)."""
+        """Return the azimuth that explains the most of each part with positions (m, 3), (S,)."""
         one = Hypothesis(positions_m, self._frequencies)
         return np.asarray(one.waves.azimuths_rad[one.explained(self._coherence).argmax(axis=1)])
 
     def is_better(self, new_m: FloatArray, old_m: FloatArray) -> bool:
-        """Whether positions (m, 3) explain more than others by the gain that decides on a size."""
+        """Return whether positions (m, 3) explain more than others by the minimum gain of a size."""
         return self._gain(*(self._power * self.explained(one) for one in (new_m, old_m))) > SIZE_GAIN
 
     def verdict(self, heard_from_rad: float | None) -> PositionVerdict:
-        """Compare orders first, then sizes in the best order, then the mounting of what fits."""
+        """Compare orders first, then sizes in the best order, then the mounting if both fit."""
         order, unsure = self.best_order()
         size, by_chance, untold = self._best_size(order)
         if size is not None and self._is_one_wave:
@@ -266,7 +267,7 @@ class Comparison:
 
     @property
     def _is_one_wave(self) -> bool:
-        """Whether an upright array hears one wave, of which another size is another angle."""
+        """Whether a vertical array receives one wave; another size then only means another angle."""
         extent_m = float(np.abs(self._positions).max())
         if np.linalg.matrix_rank(self._positions[:, :2], tol=_SAME_PLACE * extent_m) > 1:
             return False
@@ -274,7 +275,7 @@ class Comparison:
         return direct and float(np.quantile(self._azimuth()[1], _PARTS_OF_ONE)) < _ALIKE_RAD
 
     def _azimuth(self) -> tuple[float, FloatArray]:
-        """Azimuth that explains most of all parts, and how far from there that of each part is, (S,)."""
+        """Return the azimuth that explains most of all parts, and the distance of each part from it, (S,)."""
         explained, azimuths = self._claimed.explained(self._coherence), self._claimed.waves.azimuths_rad
         at = float(azimuths[explained.sum(axis=0).argmax()])
         return at, np.abs(wrap_angle(azimuths[explained.argmax(axis=1)] - at))
@@ -283,7 +284,7 @@ class Comparison:
         return np.asarray(self._coherence[:, :, order][..., order])
 
     def _gain(self, new: FloatArray, old: FloatArray) -> float:
-        r"""Gain of one hypothesis over another, 0 where it is not significant.
+        r"""Return the gain of one hypothesis over another, 0 if it is not significant.
 
         .. math:: \ln \frac{P - \sum_s E_s^{old}}{P - \sum_s E_s^{new}}
         """
@@ -294,7 +295,7 @@ class Comparison:
         return math.log(left[0] / left[1])
 
     def best_order(self) -> tuple[IndexArray, tuple[str, ...]]:
-        """Exchange two channels as long as that explains more; return the order, and what cannot be told."""
+        """Exchange channels in pairs while this explains more; return order and undetermined exchanges."""
         order = np.arange(len(self._positions))
         explained = self._claimed.best(self._coherence)
         while len(order) <= FEW:
@@ -309,7 +310,7 @@ class Comparison:
     def _alike(
         self, order: IndexArray, explained: FloatArray, tried: list[IndexArray], found: list[FloatArray]
     ) -> tuple[str, ...]:
-        """Name the exchanges that would show in some sound, and not in this."""
+        """Return the exchanges that another sound could exclude, but not this one."""
         apart = np.linalg.norm(self._positions[:, None] - self._positions, axis=-1)
         pairs = [
             "{} and {}".format(*(self._channels[one != order] + 1))
@@ -321,14 +322,14 @@ class Comparison:
         return (f"exchange of {named}: this sound fits both",) if pairs else ()
 
     def _best_size(self, order: IndexArray) -> tuple[float | None, bool, tuple[str, ...]]:
-        """Return the size that fits better, whether any order would fit as well, and what cannot be told."""
+        """Return a size that fits better, whether any order fits equally, and undetermined sizes."""
         heard = self._in_order(order)
         found = {size: Hypothesis(self._positions * size, self._frequencies) for size in (*_RIGHT, *_OFF)}
         energy = {size: one.best(heard) for size, one in found.items()}
         right, off = (max(some, key=lambda size: energy[size].sum()) for some in (_RIGHT, _OFF))
         is_off = self._gain(energy[off], energy[right]) > SIZE_GAIN
         size = off if is_off else right
-        # Numbers in another unit fit in no order either, and what explains most of the sound is no chance.
+        # Positions in another unit fit in no order either, and a fit of most of the sound is not by chance.
         explains = energy[size].sum() > _MOSTLY * self._power
         if len(order) > _LEAST_BY_CHANCE and not explains and self._by_chance(found[size], energy[size]):
             return None, True, ()
@@ -344,7 +345,7 @@ class Comparison:
         return any(gain < _ORDER_GAIN for gain in gains)
 
     def _mounting(self, heard_from_rad: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the mountings in which a sound from there is heard where it is, or why none is named."""
+        """Return the mountings that agree with sound from a known side, or the reason for no result."""
         at, misses_rad = self._azimuth()
         if np.median(misses_rad) > 2.0 * _SIDE_RAD:
             return (), ("mounting: sound comes from several sides",)
@@ -357,7 +358,7 @@ class Comparison:
         return (alike if least < _SIDE_RAD else (_turned(heard_from_rad - at),)), ()
 
     def _places(self, heard_from_rad: float) -> dict[str, FloatArray]:
-        """Azimuths at which a sound from there would be heard in every mounting."""
+        """Return the azimuths at which sound from this side would appear in every mounting."""
         turns, first_rad = _symmetry(self._positions)
         steps = 2.0 * np.pi / turns * np.arange(turns)
         mirrors = np.concatenate([[0.0, np.pi], 2.0 * first_rad + steps if turns > 1 else []])
@@ -365,7 +366,7 @@ class Comparison:
         return places | {_turned(one): np.array([heard_from_rad - one]) for one in steps[1:].tolist()}
 
     def _miss(self, azimuths_rad: FloatArray, at_rad: float) -> float:
-        """Least angle between a direction and others, each as the array hears it: ahead for behind."""
+        """Return the least angle between azimuths and a direction; equivalent directions are equal."""
         delays = MicrophoneArray(self._positions).delays_s(azimuths_rad)
         nearest = np.square(delays[:, None] - self._claimed.waves.delays_s).sum(axis=-1).argmin(axis=1)
         return float(np.abs(wrap_angle(self._claimed.waves.azimuths_rad[nearest] - at_rad)).min())
@@ -382,7 +383,7 @@ def _exchanged(order: IndexArray, a: int, b: int) -> IndexArray:
 
 
 def _symmetry(positions_m: FloatArray) -> tuple[int, float]:
-    """Return by how many parts of a full turn about the vertical an array is regular, and where it begins."""
+    """Return the rotational symmetry of an array about the vertical and the azimuth of its first part."""
     plane = positions_m[:, 0] + 1j * positions_m[:, 1]
     outer = plane[np.abs(plane).argmax()]
     for turns in range(len(plane), 1, -1):

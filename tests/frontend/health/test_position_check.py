@@ -103,7 +103,7 @@ def test_mountings_show_in_a_sound_from_a_known_side() -> None:
 def test_nothing_is_concluded_of_silence_and_own_noise(sound: np.ndarray) -> None:
     found = verdict(sound.astype(np.float32), ring(6, 0.045))
     assert found.fits
-    assert "sound that all microphones hear" in found.unjudged[0]
+    assert "coherent sound" in found.unjudged[0]
 
 
 def run(folder: Path, sound: np.ndarray, positions: np.ndarray, *options: str) -> int:
@@ -214,8 +214,8 @@ def test_talkers_in_a_live_room_give_the_positions(claimed: float | None) -> Non
 @pytest.mark.parametrize(
     ("sound", "problem"),
     [
-        (waves(HEXAGON, (40.0,)), "several sides, got it from"),
-        (waves(HEXAGON, (40.0, 55.0)), "several sides, got it from"),
+        (waves(HEXAGON, (40.0,)), "several sides, got sound from"),
+        (waves(HEXAGON, (40.0, 55.0)), "several sides, got sound from"),
         # Cards that began up to a hundredth of a second apart.
         (
             np.column_stack(
@@ -249,7 +249,7 @@ def test_an_unusable_channel_stays() -> None:
 
 def test_what_cannot_be_fitted_is_refused(around: list[np.ndarray]) -> None:
     quiet = [np.zeros((4 * RATE, 4), np.float32)]
-    with pytest.raises(InvalidArgumentError, match="2 s of sound"):
+    with pytest.raises(InvalidArgumentError, match="2 s of coherent sound"):
         fitted(quiet, SQUARE)
     with pytest.raises(InvalidArgumentError, match="3 to 16"):
         fit_positions([taken(quiet[0], SQUARE)], np.arange(4) < 2)
