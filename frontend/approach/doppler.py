@@ -1,12 +1,12 @@
-r"""Radial speed from the Doppler shift of an engine line, where it is identifiable.
+r"""Radial speed from the Doppler shift of an engine line, if it is identifiable.
 
 .. math:: f_r = f_0 / (1 + v_r / c), \qquad v_r > 0 \text{ receding},
 
-on the receiver's clock, with v_r at the time of emission. The frequency at rest f_0 of an unknown vehicle is
-unknown, and the speed of its engine varies: a change of the line by itself is no evidence of motion. It is
-read as Doppler only if the S-curve of a straight pass-by explains it better than a constant line and better
-than a smoothly drifting engine, to within the measured variance, if the harmonics agree, and if the level
-follows the range of that pass-by. In all other cases the result is `NotUsable`.
+on the receiver's clock, with v_r at the time of emission. The rest frequency f_0 of an unknown vehicle is
+unknown, and the speed of its engine varies, so a change of the line alone is no evidence of motion. It is
+interpreted as Doppler shift only if, within the measured variance, the S-curve of a straight pass-by explains
+it better than a constant line or a smoothly drifting engine. In addition, the harmonics must agree and the
+level must follow the range of this pass-by. Otherwise the result is `NotUsable`.
 """
 
 from dataclasses import dataclass
@@ -21,26 +21,26 @@ from worldstate.ground import FloatArray, NotUsable
 
 from .engine_line import HarmonicTrack
 
-# Limits of the fit: a slower source has no visible S-curve, a farther one no audible line.
+# Limits of the fit: a slower source has no visible S-curve, and the line of a more distant one is inaudible.
 SLOWEST_M_S, FASTEST_M_S, NEAREST_M, FARTHEST_M = 0.5, 40.0, 0.3, 300.0
-# Starting points of the fit, because chi-squared has local minima: times of the closest approach as shares of
+# Starting points of the fit, because chi-squared has local minima: times of the closest approach relative to
 # the track, and pairs of speed and range.
 START_PLACES = (-0.1, 0.15, 0.35, 0.5, 0.65, 0.85, 1.1)
 START_SHAPES = ((8.0, 4.0), (20.0, 10.0))
 PARAMETERS = 4
-# All starts are followed for a few evaluations, the best two to convergence.
+# All starts get some evaluations, and the best two continue to convergence.
 ROUGH_EVALUATIONS, EVALUATIONS, FINALISTS = 12, 300, 2
 
 
 def radial_speed_m_s(time_s: FloatArray, speed_m_s: float, closest_s: float, range_m: float) -> FloatArray:
-    r"""Return the radial speed at emission of the sound that arrives at `time_s`, positive while receding.
+    r"""Return the radial speed at emission for sound that arrives at `time_s`, positive while receding.
 
-    At emission time tau a source of speed v, closest at range d when tau = tau_0, has
+    At the emission time tau, a source with speed v and a smallest range d at tau = tau_0 has
 
     .. math:: r(\tau) = \sqrt{d^2 + v^2 (\tau - \tau_0)^2}, \qquad v_r = v^2 (\tau - \tau_0) / r,
 
-    and arrives at :math:`t = \tau + r(\tau)/c` with frequency :math:`f_r = f_0 / (1 + v_r / c)`. With
-    :math:`T = t - \tau_0` the emission time is closed-form,
+    The sound arrives at :math:`t = \tau + r(\tau)/c` with frequency :math:`f_r = f_0 / (1 + v_r / c)`. With
+    :math:`T = t - \tau_0` the emission time has the closed form
 
     .. math:: \tau - \tau_0 = \frac{c^2 T - \sqrt{d^2 (c^2 - v^2) + v^2 c^2 T^2}}{c^2 - v^2}.
 
@@ -61,7 +61,7 @@ def radial_speed_m_s(time_s: FloatArray, speed_m_s: float, closest_s: float, ran
 def fit_pass_by(
     time_s: FloatArray, frequency_hz: FloatArray, std_hz: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    r"""Fit f_0, v, tau_0 and d from several starting points; return them, their covariance and chi-squared.
+    r"""Fit f_0, v, tau_0 and d from several starting points; return values, covariance and chi-squared.
 
     .. math:: \chi^2 = \min_{f_0, v, \tau_0, d} \sum_k
               \frac{\big[f_0 / (1 + v_r(t_k) / c) - f_k\big]^2}{\sigma_k^2}, \qquad
@@ -94,7 +94,7 @@ def fit_pass_by(
 
 
 def radial_speed_gradient(time_s: FloatArray, values: FloatArray) -> FloatArray:
-    r"""Differentiate the radial speed by (f_0, v, tau_0, d) with central differences, shape (K, 4).
+    r"""Return derivatives of the radial speed by (f_0, v, tau_0, d), shape (K, 4), by central differences.
 
     .. math:: \frac{\partial v_r}{\partial p_i} \approx \frac{v_r(p + h_i) - v_r(p - h_i)}{2 h_i}, \qquad
               h_i = 10^{-5} \max(1, |p_i|)
@@ -115,23 +115,22 @@ def radial_speed_gradient(time_s: FloatArray, values: FloatArray) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-# A drifting engine: polynomials up to a cubic, which has as many parameters as the S-curve and so is a fair
-# rival.
+# A drifting engine: polynomials up to a cubic, which has as many parameters as the S-curve.
 DRIFT_DEGREES = (1, 2, 3)
-# With a smaller change of the expected level the test of the level has no power: engines vary by as much.
+# If the expected level changes less, it cannot be tested, because engines vary by as much.
 LEAST_SWING_DB = 3.0
-# Fewest windows in the track, three for each parameter of the S-curve, and least share of those analysed.
+# Fewest windows in the track, three per parameter of the S-curve, and their least share of the analysed ones.
 _FEWEST_WINDOWS, _LEAST_SHARE = 12, 0.6
-# Largest median reduced chi-squared of the harmonics against one fundamental, and largest of the S-curve.
+# Largest median reduced chi-squared of the harmonics relative to one fundamental, and largest of the S-curve.
 _MOST_DISAGREEMENT, _MOST_MISFIT = 4.0, 4.0
-# Relative standard deviation added to every frequency: the jitter of even a steady engine.
+# Relative standard deviation added to every frequency: the jitter of a steady engine.
 _JITTER = 3e-4
-# Least difference in BIC to each rival; 10 is "very strong" on the usual scale.
+# Least difference in BIC to each alternative; 10 is "very strong" on the usual scale.
 _LEAST_GAIN = 10.0
-# Slope of the line's level against -20 log10 of the fitted range, 1 in free field, and least correlation of
-# the two. An engine that slows down at the kerb keeps its level.
+# Limits for the slope of the line's level over -20 log10 of the fitted range, which is 1 in the free field,
+# and their least correlation. The level of an engine that slows down at the kerb does not change.
 _LEVEL_GAINS, _LEAST_CORRELATION = (0.4, 2.5), 0.8
-_MOST_STD_M_S = 1.0  # Of the radial speed, median over the track
+_MOST_STD_M_S = 1.0  # Median standard deviation of the radial speed over the track
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +142,7 @@ class RadialSpeed:
     Parameters
     ----------
     time_s : ndarray, shape (K,)
-        Receiver's clock, as in the track, seconds.
+        Time on the receiver's clock, as in the track, seconds.
     radial_speed_m_s : ndarray, shape (K,)
         v_r at emission, m/s, positive while receding.
     variance_m2_s2 : ndarray, shape (K,)
@@ -151,8 +150,8 @@ class RadialSpeed:
     rest_frequency_hz : float
         f_0, Hz.
     speed_m_s, closest_range_m, closest_time_s : float
-        Speed v (m/s) and smallest range d (m) of the straight pass-by, and the time (s) at which the sound of
-        the closest point arrives.
+        Speed v (m/s) and smallest range d (m) of the straight pass-by, and the arrival time (s) of the sound
+        from the closest point.
     misfit : float
         Reduced chi-squared of the S-curve.
 
@@ -174,7 +173,7 @@ class RadialSpeed:
 
 
 def radial_speed(track: HarmonicTrack, *, min_partials: int = 1) -> RadialSpeed | NotUsable:
-    r"""Estimate the radial speed from a tracked engine line, or return the reason why it is not identifiable.
+    r"""Estimate the radial speed from a tracked engine line, or return the reason why it is unknown.
 
     The S-curve with k = 4 parameters (f_0, v, tau_0, d) is compared with a constant line and with polynomial
     drifts over the K windows by
@@ -186,21 +185,21 @@ def radial_speed(track: HarmonicTrack, *, min_partials: int = 1) -> RadialSpeed 
     track : HarmonicTrack
         From `worldstate.frontend.approach.engine_line.track_fundamental`.
     min_partials : int
-        Fewest harmonics (median over windows); with 1 a single tone is accepted, without a check of
+        Fewest harmonics (median over windows); with 1, a single tone is accepted without a check of
         agreement.
 
     Returns
     -------
     RadialSpeed or NotUsable
         The reason is one of: too few windows, too few harmonics, harmonics that disagree, a constant line, a
-        line explained as well by drift, a line that no S-curve explains, a level that does not follow the
-        range, or too large a variance.
+        line that a drift explains equally well, a line that no S-curve explains, a level that does not follow
+        the range, or too large a variance.
 
     Notes
     -----
-    An engine whose speed falls along an S-curve during the pass-by is read as a faster vehicle: line and
-    level cannot distinguish the two (5 of 100 simulated decelerations by 10 % within a passage, none of 100
-    at the kerb).
+    If the engine speed decreases along an S-curve during the pass-by, the estimated speed is too high,
+    because line and level are the same as for a faster vehicle (5 of 100 simulated decelerations by 10 %
+    within a passage, none of 100 at the kerb).
 
     References
     ----------
@@ -251,7 +250,7 @@ def _insufficient(track: HarmonicTrack, min_partials: int) -> NotUsable | None:
 def _rejected(
     time: FloatArray, frequency: FloatArray, std: FloatArray, chi_squared: float
 ) -> NotUsable | None:
-    """Return the reason for which the S-curve is rejected, if there is one."""
+    """Return the reason why the S-curve is rejected, if there is one."""
     price, y = np.log(len(time)), frequency / std
     unit = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
 

@@ -1,9 +1,9 @@
 r"""Track the fundamental of an engine from its harmonics.
 
-Three steps: the harmonic sum scores every candidate in every window and the most evident track is taken
-(`best_path`); the frequency of each partial is measured along that track (`Windows`); all partials are
-combined into the fundamental with its variance. Their reduced chi-squared is the harmonic-consistency check:
-near one if the partials are multiples of one fundamental.
+There are three steps. The harmonic sum scores every candidate in every window, and `best_path` selects the
+track with the highest total score. The frequency of each partial is then measured along this track
+(`Windows`). Finally, all partials are combined into the fundamental and its variance. Their reduced
+chi-squared checks harmonic consistency: it is near one if the partials are multiples of one fundamental.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -16,25 +16,25 @@ from scipy import ndimage
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
-# The Hann window loses 1.4 dB half way between two unpadded bins; with four times as many 0.1 dB.
+# Half way between two bins, the Hann window loses 1.4 dB without padding and 0.1 dB with four times as many.
 ZERO_PADDING = 4
-# Median of an exponential variable over its mean: from a median of powers to the noise power.
+# Ratio of median and mean of an exponential variable: converts a median of powers to the noise power.
 MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 BAND_HIGH_HZ = 1200.0  # Highest partial used
 WINDOW_S, STEP_S = 0.25, 0.1  # Analysis window (Hann) and its step
 _MOST_RATE_HZ = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second
-# q, nats per partial. An empty partial has 0.6 nats of evidence on average: a lower price lets f / 2 win, a
-# much higher one 2 f where upper harmonics are missing.
+# q, nats per partial. An empty partial has 0.6 nats on average. With a lower price f / 2 would have the
+# highest score, and with a much higher price 2 f if upper harmonics are missing.
 _PARTIAL_PRICE = 1.0
 _FLOOR_WIDTH_HZ = 250.0  # Width of the running median that estimates the noise floor
 
 
-# Range of the fundamental, which the window resolves: a firing frequency is 20 to 200 Hz. Most partials used.
+# Range of the fundamental that the window resolves (firing frequencies are 20 to 200 Hz); number of partials.
 LOW_HZ, HIGH_HZ, MOST_HARMONICS = 25.0, 200.0, 20
 
 
 def spectrum_and_floor(frames: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
-    r"""Return the power of zero-padded windows and its noise floor, (K, bins) each, to the highest partial.
+    r"""Return power and noise floor of zero-padded windows up to the highest partial, (K, bins) each.
 
     .. math:: P_k[b] = \Big| \sum_n x_k[n]\, e^{-j 2\pi b n / 4N} \Big|^2, \qquad
               \nu_k[b] = \frac{1}{\ln 2}\, \mathrm{median}_{b'}\, P_k[b'] \text{ around } b
@@ -44,8 +44,8 @@ def spectrum_and_floor(frames: FloatArray, rate: float) -> tuple[FloatArray, Flo
     size = ZERO_PADDING * frames.shape[1]
     keep = int(np.ceil(BAND_HIGH_HZ * 1.02 * size / rate)) + 2
     power = np.abs(np.fft.rfft(frames, size)[:, :keep]) ** 2
-    # A running median as the floor (ordered statistics, as in Rohling 1983): a mean would rise under a
-    # partial. The padded bins are interpolations: every fourth is enough for the median.
+    # A running median as the floor (ordered statistics, as in Rohling 1983), because a partial would raise a
+    # mean. The padded bins are interpolations, so every fourth is sufficient for the median.
     width = round(_FLOOR_WIDTH_HZ * frames.shape[1] / rate) | 1
     floor = ndimage.median_filter(power[:, ::ZERO_PADDING], size=(1, width), mode="nearest")
     grid = np.arange(keep)
@@ -55,14 +55,14 @@ def spectrum_and_floor(frames: FloatArray, rate: float) -> tuple[FloatArray, Flo
 
 
 def best_path(ratio: FloatArray, bin_hz: float) -> FloatArray:
-    r"""Return the most evident track of the fundamental on a logarithmic grid, shape (K,), Hz.
+    r"""Return the track of the fundamental with the highest score on a logarithmic grid, shape (K,), Hz.
 
-    A candidate f in window k is scored by the power P of its partials over the noise floor,
+    The score of a candidate f in window k is computed from the power P of its partials and the noise floor,
 
     .. math:: Q_k(f) = \sum_h \big[\ln(1 + P_k(h f) / \nu_k(h f)) - q\big],
 
-    where the price q per partial keeps f / 2, half of whose partials are empty, from winning over f. The
-    track is the most evident one whose rate of change is limited.
+    where the price q per partial lowers the score of f / 2, half of whose partials are empty. The rate of
+    change along the track is limited.
 
     Source: A. M. Noll, "Pitch determination of human speech by the harmonic product spectrum, the harmonic
     sum spectrum and a maximum likelihood estimate", 1969; the track by A. J. Viterbi's algorithm, 1967.
@@ -70,11 +70,11 @@ def best_path(ratio: FloatArray, bin_hz: float) -> FloatArray:
     .. math:: \hat f = \arg\max_{f_1 .. f_K} \sum_k \Big[ Q_k(f_k) - \frac{(i_k - i_{k-1})^2}{r^2} \Big],
               \qquad |i_k - i_{k-1}| \le r
 
-    with Q above, i_k the index of f_k on the grid, and r the largest change from window to window.
+    with i_k the index of f_k on the grid, and r the largest change between windows.
 
     Shapes: ratio (K, bins).
     """
-    # Half a resolution at the highest partial, so that no partial falls between two candidates.
+    # Half a resolution at the highest partial, so that no partial is between two candidates.
     step = 0.5 / (WINDOW_S * BAND_HIGH_HZ)
     grid = np.geomspace(LOW_HZ, HIGH_HZ, int(np.log(HIGH_HZ / LOW_HZ) / step) + 2)
     evidence = _harmonic_evidence(ratio, grid, bin_hz)
@@ -110,28 +110,28 @@ def _viterbi(evidence: FloatArray, reach: int) -> IndexArray:
     return path
 
 
-# Largest correction by one Newton step, in resolutions 1 / window: beyond it lies the edge of the main lobe.
+# Largest correction in one Newton step, in resolutions 1 / window: near the edge of the main lobe.
 REACH = 0.75
-# Power over the floor from which a partial enters the combined estimate.
+# Least ratio of power and floor for a partial to be used in the combined estimate.
 _LEAST_SNR = 15.0
 
 
 @dataclass(frozen=True, slots=True)
 class HarmonicTrack:
-    """Fundamental over time; windows without a usable partial are left out."""
+    """Fundamental over time; windows without a usable partial are omitted."""
 
     time_s: FloatArray  # Centre of each window from the first sample, on the receiver's clock
     frequency_hz: FloatArray  # Fundamental
-    # Of the fundamental, from the SNR of its partials, increased where they disagree
+    # Variance of the fundamental from the SNR of its partials, increased if they disagree
     variance_hz2: FloatArray
     n_partials: IndexArray  # Number of partials used
-    # Reduced chi-squared of harmonic consistency; 0 with a single partial, which has no check.
+    # Reduced chi-squared of harmonic consistency; 0 with a single partial, which cannot be checked
     misfit: FloatArray
     level_db: FloatArray  # Power of all partials, 10 log10, relative to samples of unit mean square
-    windows: int  # Number of windows analysed, K of them usable
+    windows: int  # Number of analysed windows, K of them usable
 
     def usable(self) -> "HarmonicTrack":
-        """Return the windows with a partial."""
+        """Return the track with only the windows that have a partial."""
         found = self.n_partials > 0
         columns = (one.name for one in fields(self) if one.name != "windows")
         return replace(self, **{name: getattr(self, name)[found] for name in columns})
@@ -139,11 +139,11 @@ class HarmonicTrack:
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    r"""Samples of every window with the noise floor of their spectra.
+    r"""Samples of every window and the noise floor of their spectra.
 
-    Each partial is demodulated by the track found so far and its slope, so that a gliding one stays narrow,
-    and its frequency is moved to the maximum of the windowed periodogram by a Newton step. To first order in
-    the noise, with n counted from the centre of the window w,
+    Each partial is demodulated with the current track and its slope, so that a gliding partial stays narrow.
+    A Newton step then moves its frequency to the maximum of the windowed periodogram. To first order in the
+    noise, with n counted from the centre of the window w,
 
     .. math:: \sigma_h^2 = \frac{1}{2\,\mathrm{SNR}} \frac{(\sum w)^2}{\sum w^2}
               \frac{\sum w^2 n^2}{(\sum w n^2)^2}, \qquad \mathrm{SNR} = \text{peak power over floor}.
@@ -156,7 +156,7 @@ class Windows:
     Source: the variance is the first-order perturbation of the windowed maximum of Rife and Boorstyn 1974.
     """
 
-    time_s: FloatArray  # Of their centres
+    time_s: FloatArray  # Centres of the windows
     frames: FloatArray  # Samples, not windowed
     shape: FloatArray  # The window
     floor: FloatArray  # Noise power of the windowed, zero-padded spectra
@@ -171,7 +171,7 @@ class Windows:
 def measure_fundamental(
     windows: Windows, fundamental_hz: FloatArray, slope_hz_s: FloatArray
 ) -> HarmonicTrack:
-    r"""Refine a track of the fundamental by all its partials; of windows without any it says nothing.
+    r"""Refine a track of the fundamental with all its partials; windows without partials are marked.
 
     .. math:: \hat f = \frac{\sum_h h f_h / \sigma_h^2}{\sum_h h^2 / \sigma_h^2}, \qquad
               \mathrm{var}(\hat f) = \frac{\max(\chi^2, 1)}{\sum_h h^2 / \sigma_h^2}
@@ -188,7 +188,7 @@ def measure_fundamental(
         demodulated *= back
         measured.append(_partial(windows, demodulated, h * fundamental_hz))
     frequency, variance, power = (np.stack(part, axis=1) for part in zip(*measured, strict=True))
-    # All partials into one fundamental per window, by their inverse variances.
+    # All partials combined into one fundamental per window, with inverse variances as weights.
     weight = 1.0 / variance
     count = np.count_nonzero(weight, axis=1)
     information = np.maximum((weight * partials**2).sum(axis=1), np.finfo(float).tiny)
@@ -206,7 +206,7 @@ def measure_fundamental(
 def _partial(
     windows: Windows, demodulated: Complex128Array, expected_hz: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return frequency, variance and power of a partial per window; infinite variance if too weak."""
+    """Return frequency, variance and power of a partial in each window; infinite variance if too weak."""
     n, turns = windows.n, windows.rate_hz / (2 * np.pi)
     shift, peak = _newton_shift(demodulated, n)
     floor = _floor_at(windows, expected_hz)
@@ -222,7 +222,7 @@ def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
 
 
 def _newton_shift(demodulated: Complex128Array, n: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Newton step from d = 0, rad per sample, to the maximum of |sum z exp(-j d n)|^2, and the maximum."""
+    """Return the Newton step from d = 0 to the peak of |sum z exp(-j d n)|^2, and its value; d in rad."""
     s0, s1, s2 = (demodulated @ np.stack([np.ones_like(n), n, n**2], axis=1)).T
     height = np.abs(s0) ** 2
     slope = 2.0 * (s0.conj() * s1).imag
@@ -234,14 +234,14 @@ def _newton_shift(demodulated: Complex128Array, n: FloatArray) -> tuple[FloatArr
 
 
 def _line_variance(window: FloatArray, n: FloatArray) -> float:
-    """Variance, (rad per sample)^2 at unit SNR, of the peak of a windowed periodogram."""
+    """Return the variance of the peak of a windowed periodogram, (rad per sample)^2 at unit SNR."""
     spread = np.sum(window**2 * n**2) / np.sum(window * n**2) ** 2
     return float(0.5 * window.sum() ** 2 / np.sum(window**2) * spread)
 
 
-# Each pass measures along the track and the slope of the one before.
+# Each pass measures along the track and the slope of the previous pass.
 PASSES = 3
-# Longest signal at one call: an hour at 48 kHz is 1.7e8 samples.
+# Longest signal per call: an hour at 48 kHz has 1.7e8 samples.
 MAX_SAMPLES = 200_000_000
 
 
@@ -265,12 +265,12 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
     Returns
     -------
     HarmonicTrack
-        Frequencies in Hz at the centres of the windows; empty where nothing exceeds the noise.
+        Frequencies in Hz at the centres of the windows; empty if nothing exceeds the noise.
 
     Raises
     ------
     InvalidArgumentError
-        On a wrong shape, too few samples, non-finite values or too low a sample rate.
+        If the shape is wrong, samples are too few or not finite, or the sample rate is too low.
 
     References
     ----------
@@ -292,7 +292,7 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
     shortest = int(np.ceil(WINDOW_S * rate)) + 1
     if not shortest <= len(x) <= MAX_SAMPLES:
         raise InvalidArgumentError(f"samples: expected {shortest} .. {MAX_SAMPLES} samples, got {len(x)}")
-    # With zero phase, to at least three times the highest partial.
+    # Decimation with zero phase, to at least three times the highest partial.
     factor = int(rate // (3.0 * BAND_HIGH_HZ))
     if factor > 1:
         x, rate = scipy.signal.decimate(x, factor, ftype="fir", zero_phase=True), rate / factor
@@ -311,7 +311,7 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
 
 
 def _slope(time: FloatArray, frequency: FloatArray) -> FloatArray:
-    """Slope of the track, Hz per second, by straight lines through five windows."""
+    """Return the slope of the track, Hz per second, from straight lines through five windows."""
     if len(time) < 5:
         return np.zeros_like(frequency)
     return np.asarray(scipy.signal.savgol_filter(frequency, 5, 1, deriv=1, delta=float(np.diff(time).mean())))

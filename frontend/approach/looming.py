@@ -1,24 +1,24 @@
-r"""Acoustic looming: the reciprocal time to arrival from the growth of the sound level.
+r"""Acoustic looming: the reciprocal of the time to arrival (TTA) from the growth of the sound level.
 
 For a point source at range d the band energy E goes as 1/d^2, eq. (2):
 
 .. math:: \frac{d}{dt} \log E = -2 \frac{\dot d}{d} = \frac{2}{\mathrm{TTA}}
 
-It depends on neither the source level nor the distance nor a constant attenuation. One window is read twice:
+It depends neither on the source level nor on the distance nor on a constant attenuation. One window gives two
+estimates:
 
-* the slope of log E over the window, which is 2 / TTA somewhere near its middle;
-* the straight line through E^(-1/2), which is proportional to d itself: exact at constant speed, and
+* the slope of log E over the window, which is 2 / TTA near its middle;
+* the straight line through E^(-1/2), which is proportional to d. It is exact at constant speed and is
   evaluated at the END of the window.
 
-Both are on the receiver's clock: what arrives now was emitted d / c ago. Noise N from elsewhere makes both
-too small, by a seventh at 10 dB and by two thirds at 0 dB; where N is known the range is that of E - N.
-Diffraction round a corner biases both: what is measured is then the approach of the sound, not of the
-vehicle.
+Both refer to the receiver's clock: sound that arrives now was emitted d / c earlier. Other noise N reduces
+both, by a seventh at 10 dB and by two thirds at 0 dB. If N is known, the range is computed from E - N. After
+diffraction at a corner, both describe the approach of the sound, not of the vehicle.
 
-The accuracy is limited by the randomness of the sound itself, which no number of microphones averages out: n
-energies over T seconds, each of scatter s = (bandwidth x interval)^(-1/2), give TTA with a relative error of
-about (s / 2) (TTA / T + 1/2) sqrt(12 / n). Noise from 0.3 to 20 kHz, 1 to 3 s away, scatters by 4.0 % when
-read from one second, as a stream does, and by 1.5 % when read from two.
+The randomness of the sound limits the accuracy, and averaging over microphones does not reduce it. For n
+energies over T seconds, each with a relative deviation s = (bandwidth x interval)^(-1/2), the relative error
+of TTA is about (s / 2) (TTA / T + 1/2) sqrt(12 / n). For noise from 0.3 to 20 kHz, 1 to 3 s away, it is 4.0 %
+with a window of one second, as used for a stream, and 1.5 % with two seconds.
 
 References
 ----------
@@ -34,17 +34,17 @@ from numpy.typing import ArrayLike
 
 from worldstate.ground import FloatArray, InvalidArgumentError, NotUsable, finite_array, mean
 
-# Two parameters and a scatter of their own need two degrees of freedom.
+# Two parameters and the residual deviation need two degrees of freedom.
 MIN_POINTS = 4
-# Scatter of log E about the fit, nats (3 dB), beyond which energy is not that of one approaching source.
+# Deviation of log E from the fit, nats (3 dB), above which the energy is not that of one approaching source.
 MAX_LOG_STD = 0.7
-# The fitted range at the end of the window must be this many standard deviations from zero: nearer to it the
-# quotient 1/TTA has no useful variance.
+# The fitted range at the end of the window must be this many standard deviations above zero. Closer to zero,
+# the quotient 1/TTA has no useful variance.
 _MIN_RANGE_SIGMA = 2.0
-# Below this ratio at the end of the window (1.8 dB) the beginning of the window is noise alone.
+# Below this ratio at the end of the window (1.8 dB), the beginning of the window is noise only.
 _LEAST_RATIO = 1.5
-# Share of an energy that counts as the source's where the noise would leave less, for the first guess only;
-# steps of the fit after it (a third changes 1/TTA by less than a tenth of its error); least ratio of ranges.
+# Smallest share of an energy that is attributed to the source, for the first guess only; steps of the
+# subsequent fit (a third one changes 1/TTA by less than a tenth of its error); smallest ratio of the ranges.
 _LEAST_EXCESS, _STEPS, _LEAST_RANGE = 0.1, 2, 0.02
 
 
@@ -57,8 +57,8 @@ class Looming:
     Parameters
     ----------
     inverse_tta_hz : float
-        1/TTA = -d_dot / d at the end of the window from the line through E^(-1/2), 1/s, positive while
-        closing.
+        1/TTA = -d_dot / d at the end of the window, from the line through E^(-1/2), 1/s, positive for an
+        approach.
     std_hz : float
         Its standard error, 1/s, > 0.
     log_slope_hz : float
@@ -88,7 +88,7 @@ def looming(
               \frac{1}{\mathrm{TTA}} = -\frac{b}{a} \text{ at } t = 0, \qquad
               \frac{d}{dt} \log E = \frac{2}{\mathrm{TTA}}
 
-    The fit is weighted by the energies of the model, because log E scatters evenly.
+    The fit is weighted by the energies of the model, because log E has a constant variance.
 
     Parameters
     ----------
@@ -97,22 +97,22 @@ def looming(
     log_energy : array_like, shape (n,)
         Natural logarithm of the band energy.
     floor_std : float
-        Standard deviation of `log_energy` by chance alone, nats, > 0: 1 / sqrt(bandwidth x interval) for
-        noise-like sound. The standard errors assume at least this.
+        Standard deviation of `log_energy` by chance, nats, > 0: 1 / sqrt(bandwidth x interval) for noise-like
+        sound. It is the lower limit for the standard errors.
     noise_energy, noise_energy_std : float
-        Mean energy N of all but the approaching source, in the unit of E, and its standard deviation.
+        Mean energy N of all other sources, in the unit of E, and its standard deviation.
 
     Returns
     -------
     Looming or NotUsable
-        Rates in 1/s; the slope of log E is that of the energies as they are, noise included. Not usable if
-        the energies scatter by more than 3 dB about the fit, if the fitted range reaches zero within its
-        error, or if the source has less than 1.5 times the energy of the noise.
+        Rates in 1/s; the slope of log E includes the noise. Not usable if the energies deviate from the fit
+        by more than 3 dB, if the fitted range is zero within its error, or if the source has less than 1.5
+        times the energy of the noise.
 
     Raises
     ------
     InvalidArgumentError
-        On fewer than four points, another shape, unsorted times or numbers that are not finite.
+        If there are fewer than four points, shapes differ, times are unsorted or numbers are not finite.
 
     References
     ----------
@@ -121,14 +121,14 @@ def looming(
 
     Examples
     --------
-    A source 20 m away at the end of the window, closing at 10 m/s:
+    A source that is 20 m away at the end of the window and approaches at 10 m/s:
 
     >>> times_s = np.arange(-0.95, 0.0, 0.1)
     >>> found = looming(times_s, -2 * np.log(20 - 10 * times_s), floor_std=0.01)
     >>> round(found.inverse_tta_hz, 3), round(found.log_slope_hz / 2, 3)
     (0.5, 0.403)
 
-    The same in noise as loud as the source is at the end:
+    The same source in noise that is as loud as the source at the end:
 
     >>> energy = (20 - 10 * times_s) ** -2.0 + 1 / 1000
     >>> round(looming(times_s, np.log(energy), 0.01, noise_energy=1 / 1000).inverse_tta_hz, 3)
@@ -144,7 +144,7 @@ def looming(
 def approach_rate(
     times: FloatArray, energies: FloatArray, floor_std: float, noise_energy: float, noise_energy_std: float
 ) -> Looming | NotUsable:
-    """Return what `looming` does, of arguments that it would take: nothing is checked."""
+    """Return the result of `looming` without checks of the arguments."""
     level = float(mean(energies))
     scale = float(np.exp(-level))
     design = np.array([np.ones(len(times)), times])
@@ -167,25 +167,25 @@ def approach_rate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """Energy ``(level + slope t)^-2`` of a source, with what noise and scatter do to its parameters."""
+    """Energy ``(level + slope t)^-2`` of a source, with the errors of its parameters."""
 
     level: float
     slope: float
-    scatter: float  # Relative, of the energies
-    covariance: FloatArray  # shape (2, 2): For a relative scatter of one
-    by_noise: FloatArray  # shape (2,): Derivative by the noise
+    scatter: float  # Relative deviation of the energies
+    covariance: FloatArray  # shape (2, 2): For a relative deviation of one
+    by_noise: FloatArray  # shape (2,): Derivative with respect to the noise
 
 
 def _fit_source(design: FloatArray, energy: FloatArray, noise: float) -> _Source | None:
-    """Fit E = N + (a + b t)^-2 with errors in proportion to E; None if the range reaches zero."""
+    """Fit E = N + (a + b t)^-2 with errors proportional to E; None if the range reaches zero."""
     # Gauss-Newton from the line through E^(-1/2).
     excess = np.log(np.maximum(energy - noise, _LEAST_EXCESS * energy))
-    # Weights from the exponential fit, which is smooth: weights from the noisy values would bias the line.
+    # Weights from the smooth exponential fit, because weights from the noisy values would bias the line.
     times, smooth = design[1], _fit_line(design, excess, None)
     line = _fit_line(design, np.exp(-0.5 * excess), np.exp(smooth.level + smooth.slope * times))
     level, slope = line.level, line.slope
     for _ in range(_STEPS + 1):
-        # A straight line is least at one end.
+        # A straight line has its minimum at one end.
         ranges, ends = level + slope * times, (level + slope * times[0], level + slope * times[-1])
         if min(ends) <= _LEAST_RANGE * max(ends):
             return None
@@ -198,7 +198,7 @@ def _fit_source(design: FloatArray, energy: FloatArray, noise: float) -> _Source
         covariance = np.array([[d, -b], [-b, a]]) / (a * d - b * b)
         steps = (covariance @ (jacobian @ residual)).tolist()
         level, slope = level + steps[0], slope + steps[1]
-    # The last step is that of the residuals, which the scatter counts: it has become too small to matter.
+    # The residuals are those before the last step, which is too small to matter.
     scatter = math.sqrt(residual @ residual / (len(times) - 2))
     return _Source(level, slope, scatter, covariance, -covariance @ (jacobian @ weights))
 
@@ -213,7 +213,7 @@ class _Line:
 
 
 def _fit_line(design: FloatArray, values: FloatArray, weights: FloatArray | None) -> _Line:
-    """Fit a line in closed form, by the rows of one and of the times: least squares, weighted if asked."""
+    """Fit a line in closed form to rows of ones and of times, by (weighted) least squares."""
     weighted = design if weights is None else design * weights
     (s0, s1), (_, s2) = (weighted @ design.T).tolist()
     v0, v1 = (weighted @ values).tolist()
@@ -225,33 +225,34 @@ def _fit_line(design: FloatArray, values: FloatArray, weights: FloatArray | None
     return _Line(slope, level, scatter)
 
 
-# An approach is heard for three to six seconds: of half a minute it leaves the lower third to the noise, of
-# less than five seconds not.
+# An approach is audible for three to six seconds. Of half a minute, the lower third is then still noise; of
+# less than five seconds it is not.
 _LONGEST_HOPS, _FEWEST_HOPS = 300, 50
 _Z10, _Z30 = -1.2816, -0.5244
-# As long as too little was heard, the noise is between nothing and the lowest energy of the window.
+# With a shorter history, the noise is between zero and the lowest energy of the window.
 _UNKNOWN_SHARE = 0.25
 
 
 class EnergyFloor:
-    r"""Running level of the noise that is there without an approaching source.
+    r"""Running level of the noise without an approaching source.
 
-    From the lower quantiles of the log-energies of the last half minute, as of a normal distribution:
+    It is computed from lower quantiles of the log-energies of the last half minute, assuming a normal
+    distribution:
 
-    .. math:: \sigma = \frac{q_{30} - q_{10}}{\Phi^{-1}(.3) - \Phi^{-1}(.1)}, \qquad
-              \log N = q_{30} - \Phi^{-1}(.3)\, \sigma
+    .. math:: \sigma = \frac{q_{30} - q_{10}}{\Phi^{-1}(0.3) - \Phi^{-1}(0.1)}, \qquad
+              \log N = q_{30} - \Phi^{-1}(0.3)\, \sigma
     """
 
     def __init__(self) -> None:
         self._log_energies: deque[float] = deque(maxlen=_LONGEST_HOPS)
 
     def push(self, energy: float) -> None:
-        """Take the energy of a hop; silence is left out."""
+        """Add the energy of a hop; zero energy is ignored."""
         if energy > 0.0:
             self._log_energies.append(math.log(energy))
 
     def read(self, lowest: float, least_log_std: float) -> tuple[float, float]:
-        """Return mean and deviation; of a stream that has just begun only that it is below the lowest."""
+        """Return mean and deviation; for a short history, zero with a deviation from the lowest energy."""
         count = len(self._log_energies)
         if count < _FEWEST_HOPS:
             return 0.0, _UNKNOWN_SHARE * lowest

@@ -1,8 +1,8 @@
 r"""Maximum-likelihood frequency of a single tone, and the engine line of a stream.
 
-A coarse search on a zero-padded FFT finds the main lobe, Gauss-Newton steps in (in-phase, quadrature,
-frequency) find the maximum of the likelihood in white noise. The tone is fitted as a cosine and a sine, so
-that its negative frequency does not bias it.
+A coarse search on a zero-padded FFT finds the main lobe. Gauss-Newton steps in (in-phase, quadrature,
+frequency) then find the maximum of the likelihood in white noise. The tone is fitted as a cosine and a sine,
+so that its negative frequency does not bias it.
 
 Source: D. C. Rife and R. R. Boorstyn, "Single-tone parameter estimation from discrete-time observations",
 IEEE Trans. IT 20, 1974.
@@ -25,10 +25,10 @@ from worldstate.ground.values import vertex
 
 # Three parameters are fitted; with fewer samples the residual gives no estimate of the noise.
 FEWEST_SAMPLES = 8
-# A grid of a quarter of the resolution puts the coarse peak within an eighth of it: well inside the main
+# A grid of a quarter of the resolution places the coarse peak within an eighth of it, well inside the main
 # lobe.
 ZERO_PADDING = 4
-# The steps converge quadratically and end by their tolerance; this many are for a low SNR.
+# The steps converge quadratically and end at a tolerance; this many are needed only at a low SNR.
 STEPS = 8
 # Ridge of the 2 x 2 normal equations, which are singular for a tone at 0 Hz.
 _ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
@@ -71,25 +71,25 @@ def estimate_tone(samples: ArrayLike, sample_rate_hz: float) -> Tone:
 
     .. math:: \hat f = \arg\max_f \; y^T H (H^T H)^{-1} H^T y
 
-    with H the columns :math:`\cos 2\pi f t, \sin 2\pi f t`. One resolution, rate / n, is left out at 0 and at
-    rate / 2, where a tone is not distinguishable from an offset.
+    where H has the columns :math:`\cos 2\pi f t, \sin 2\pi f t`. One resolution, rate / n, is excluded at 0
+    and at rate / 2, where a tone cannot be distinguished from an offset.
 
     Parameters
     ----------
     samples : array_like, shape (n,)
-        n >= 8; the noise around the tone is taken for white.
+        n >= 8; the noise around the tone is assumed to be white.
     sample_rate_hz : float
         Samples per second, > 0.
 
     Returns
     -------
     Tone
-        With its SNR: below a threshold (about 15 dB for :math:`\eta N`) the highest peak is noise.
+        Tone with its SNR; below a threshold (about 15 dB for :math:`\eta N`) the highest peak is noise.
 
     Raises
     ------
     InvalidArgumentError
-        On a wrong shape, non-finite samples or a signal that is zero.
+        If the shape is wrong, samples are not finite or all samples are zero.
 
     Notes
     -----
@@ -120,7 +120,7 @@ def estimate_tone(samples: ArrayLike, sample_rate_hz: float) -> Tone:
     inside = (omegas >= bounds[0]) & (omegas <= bounds[1])
     coarse = omegas[inside][np.argmax(np.abs(rfft(y, size))[inside])]
     omega, amplitude, residual = climb(y, float(coarse), bounds)
-    # Three parameters are fitted.
+    # The fit has three parameters.
     power = float(residual @ residual) / (len(y) - 3)
     snr = abs(amplitude) ** 2 / max(2.0 * power, np.finfo(float).tiny)
     snr = min(max(snr, np.finfo(float).tiny), 1e300)
@@ -132,13 +132,13 @@ def estimate_tone(samples: ArrayLike, sample_rate_hz: float) -> Tone:
 def climb(
     y: FloatArray, omega: float, bounds: tuple[float, float], tolerance: float = 1e-7, steps: int = STEPS
 ) -> tuple[float, complex, FloatArray]:
-    r"""Fit one tone by Gauss-Newton from a coarse peak, unchecked: frequency, amplitude, what is left of y.
+    r"""Fit one tone by Gauss-Newton from a coarse peak; return frequency, amplitude and residual of y.
 
     .. math:: \omega \leftarrow \omega + \frac{\mathrm{Re}\, g^H r}{g^H g}, \qquad
               r = P^\perp y, \quad g = P^\perp \frac{\partial H}{\partial \omega} \hat a, \quad \hat a = H^+ y
 
-    with P the projection off the columns of H, as in `estimate_tone` (variable projection). Steps are held
-    within the main lobe.
+    with P the projection onto the complement of the columns of H, as in `estimate_tone` (variable
+    projection). Steps are limited to the main lobe. The arguments are not checked.
 
     Shapes: y (n,).
     """
@@ -155,7 +155,7 @@ def climb(
 
 
 def tone_wave(omega: float, count: int) -> ComplexArray:
-    r"""Return a complex wave, n counted from the centre, as a product of two short ones to save exponentials.
+    r"""Return a complex wave, n counted from the centre; a product of two short waves saves exponentials.
 
     .. math:: z_n = e^{j \omega (n - (N - 1) / 2)}
 
@@ -171,12 +171,12 @@ def tone_wave(omega: float, count: int) -> ComplexArray:
 
 
 def _step(y: FloatArray, omega: float, n: FloatArray) -> tuple[float, FloatArray]:
-    """Least-squares step in frequency, the amplitude being refitted along with it (variable projection)."""
-    # Everything is a product of few rows: the tone's H, its derivative by omega, and y.
+    """Return the least-squares step in frequency with a refitted amplitude (variable projection)."""
+    # All values are products of five rows: the tone's H, its derivative with respect to omega, and y.
     wave = tone_wave(omega, len(y))
     rows = np.stack([wave.real, -wave.imag, -wave.imag * n, wave.real * -n, y])
     gram = rows @ rows.T
-    # A row of zeros, the sine of 0 Hz, gets no amplitude.
+    # The ridge gives a row of zeros, the sine at 0 Hz, no amplitude.
     inner = gram[:2, :2].copy()
     inner.flat[::3] += _ROUNDING * len(y)
     onto = np.linalg.solve(inner, gram[:2, 2:])
@@ -188,28 +188,29 @@ def _step(y: FloatArray, omega: float, n: FloatArray) -> tuple[float, FloatArray
     return float(image @ rest) / size if size > 0.0 else 0.0, np.asarray(fit)
 
 
-# Firing frequencies of road vehicles, idling motorcycle single to a car at high revolutions.
+# Firing frequencies of road vehicles, from an idling single-cylinder motorcycle to a car at high revolutions.
 ENGINE_BAND_HZ = (20.0, 400.0)
-# Length of the fit, and microphones that are averaged: at engine frequencies those near the centre of the
-# array lie within a fraction of a wavelength.
+# Length of the fit, and number of averaged microphones: those near the centre of the array are within a
+# fraction of a wavelength at engine frequencies.
 _WINDOW_S, _MOST_CHANNELS = 1.0, 4
-# Bins per resolution (a grid this fine starts the climb within its lobe), resolutions per block of the coarse
-# floor, and the ring of resolutions around the line whose median is its floor: beyond its own side lobes.
+# Bins per resolution, fine enough to start within the main lobe; resolutions per block of the coarse floor.
 _PADDING = 2
 _BLOCK = 24
+# Range of resolutions around the line whose median is its floor; it begins beyond the side lobes of the line.
 _RING = (5, 40)
-# Least ratio of the peak to the floor, A^2 N / 4 sigma^2, or 15.6 dB for eta N: white noise exceeds it in one
-# window of a thousand.
+# Least ratio of the peak to the floor, A^2 N / 4 sigma^2, or 15.6 dB for eta N. White noise exceeds it in one
+# of a thousand windows.
 _EVIDENT = 18.0
-# What white noise leaves beside a line is up to twice what is around it. More is the line's own: of a
-# frequency that wanders by .2 to 1 %, the error is 2.5 times what white noise of that power would make.
+# In white noise, the residual near a line has up to twice the power of the surroundings. More power comes
+# from the line itself: for a frequency that varies by 0.2 to 1 %, the error is 2.5 times that of white noise
+# with this power.
 _CHANCE, _WANDER = 2.0, 6.0
-# Tolerance of the refinement as a share of a resolution, the bound for eta N of 80 dB. From the vertex of a
-# parabola two steps suffice; where three do not converge there is no tone.
+# Tolerance of the refinement as a share of a resolution, the bound for an eta N of 80 dB. From the vertex of
+# a parabola two steps are sufficient; if three do not converge, there is no tone.
 _TOLERANCE, _STEPS = 1e-4, 3
-# Lowest frequency, periods in the window: below, a tone is not distinguishable from an offset.
+# Lowest frequency in periods per window; below, a tone cannot be distinguished from an offset.
 _FEWEST_PERIODS = 4.0
-# Median of an exponential variable over its mean: from a median of powers to the noise power.
+# Ratio of median and mean of an exponential variable: converts a median of powers to the noise power.
 _MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 
 
@@ -223,23 +224,23 @@ class ToneReading:
     61.2
     """
 
-    frequency_hz: float  # Mean over the window, by the stream's own sample rate
-    frequency_std_hz: float  # Of that mean
-    snr: float  # eta = A^2 / 2 sigma^2 per decimated sample, sigma^2 from what is around and beside the line
+    frequency_hz: float  # Mean over the window, relative to the stream's nominal sample rate
+    frequency_std_hz: float  # Standard deviation of this mean
+    snr: float  # eta = A^2 / 2 sigma^2 per decimated sample; sigma^2 from the noise around and near the line
 
 
 class ToneStage:
-    r"""Keep the decimated band of one averaged channel over the window and fit a tone.
+    r"""Tracks a tone in the last second of one averaged channel.
 
-    A few microphones near the centre of the array are averaged: at engine frequencies they lie within a
-    fraction of a wavelength, so that a tone from any direction adds up. a `Decimator` keeps the band, at some
-    1200 samples per second. In the last second the peak with the highest ratio to the noise around it is
-    searched under a Hann window, so that neither harmonics nor rumble leak into it, and refined as in `tone`.
+    Some microphones near the centre of the array are averaged. At engine frequencies they are within a
+    fraction of a wavelength, so a tone from any direction adds up. A `Decimator` reduces the band to about
+    1200 samples per second. A Hann window over the last second keeps harmonics and rumble from leaking into
+    the tone. The peak with the highest ratio to the surrounding noise is then refined as in `estimate_tone`.
 
-    The noise floor is the median power around the line, or what is left beside the line where that is more: a
-    line that wanders, and a hump of coloured noise, leave most of themselves. The standard deviation is the
-    bound of Rife and Boorstyn at that signal-to-noise ratio, with what a wandering line leaves counted for
-    more.
+    The noise floor is the median power around the line or the residual near it, whichever is larger: a
+    varying frequency or a hump of coloured noise leaves most of its power as residual. The standard deviation
+    is the bound of Rife and Boorstyn at this signal-to-noise ratio, with a larger weight for the residual of
+    a varying frequency.
     """
 
     def __init__(
@@ -257,7 +258,7 @@ class ToneStage:
         self._spectrum = _Spectrum(len(self._band_samples), self._rate, band_hz)
 
     def push(self, samples: Float32Array, mask: ChannelMask) -> None:
-        r"""Take the samples of a hop (n, M), of which the microphones of a mask count.
+        r"""Process the samples of a hop (n, M); the mask selects microphones.
 
         .. math:: y[m] = \sum_n h[n]\, \frac1{|C|} \sum_{i \in C} x_i[m D + n]
 
@@ -270,13 +271,13 @@ class ToneStage:
         self._band_samples = np.concatenate([self._band_samples, new])[len(new) :]
 
     def read(self) -> ToneReading | NotUsable:
-        r"""Fit the line of the window that ends with the last hop.
+        r"""Fit the line in the window that ends with the last hop.
 
         .. math:: \hat f = \arg\max_f \; y^H H (H^H H)^{-1} H^H y, \qquad
                   \eta = \frac{|\hat A|^2}{2 \hat\sigma^2}, \qquad
                   \sigma_f^2 = \frac{12\, f_s^2}{(2\pi)^2\, \eta\, N (N^2 - 1)}
 
-        where :math:`\eta N / 2 > 18`.
+        It is usable if :math:`\eta N / 2 > 18`.
         """
         if self._n_out < len(self._band_samples):
             return NotUsable(f"needs {len(self._band_samples) / self._rate:.2f} s of sound")
@@ -323,7 +324,7 @@ class _Spectrum:
         self._band = slice(int(np.ceil(low / self._step)), int(high / self._step) + 1)
 
     def offset(self, sound: FloatArray) -> float:
-        """Mean under the window, to which a tone of a few periods does not contribute."""
+        """Return the mean under the window, to which a tone of a few periods does not contribute."""
         return float(self._window @ sound) / float(self._window.sum())
 
     def power(self, sound: FloatArray) -> FloatArray:
@@ -351,7 +352,7 @@ class _Spectrum:
         return float(around[len(around) // 2]) / _MEDIAN_OF_EXPONENTIAL + _least(power)
 
     def beside(self, rest: FloatArray, omega: float) -> float:
-        """Return the mean power beside a line that was taken out, as far as its own lobes reach."""
+        """Return the mean power of the residual near a removed line, within the reach of its lobes."""
         centre, reach = round(omega / self._step), _PADDING * _RING[0]
         return float(self.power(rest)[max(centre - reach, 1) : centre + reach + 1].mean())
 

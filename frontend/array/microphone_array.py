@@ -1,4 +1,4 @@
-"""The microphone array: positions, delays, steering vectors, the channels in use, and two roof arrays.
+"""Microphone array: positions, delays, steering vectors, selected channels and two roof arrays.
 
 Axes are those of `base_link`: x forward, y left, z up.
 """
@@ -17,20 +17,20 @@ SPEED_OF_SOUND_M_S = 343.0
 
 Ambiguity = Literal["cone", "front-back", "up-down", "mirror", "none"]
 
-# Extent along a principal axis, relative to the largest, below which an array is flat: a millimetre in a
-# metre, the accuracy of mounting.
+# Extent along a principal axis relative to the largest extent below which an array is flat: 1 mm per metre,
+# the accuracy of mounting.
 _FLAT = 1e-3
-# Direction cosine, 10 degrees, above which a normal points along an axis of the vehicle.
+# Direction cosine (10 degrees) above which a normal is considered parallel to an axis of the vehicle.
 _ALONG_AXIS = 0.985
 
-# Covariances grow with the square: 40 bins of 1024 channels take 0.3 GB.
+# Covariances grow with the square: 40 bins of 1024 channels need 0.3 GB.
 MAX_MICROPHONES = 1024
 LEAST_SPACING_M = 1e-4
-"""Two microphones nearer than this are at one place: capsules are millimetres wide."""
+"""Microphones closer than this are considered identical, because capsules are several millimetres wide."""
 
-# Our own placement of 56 microphones: 7 staggered rows of 8, each moved off its row by a low-discrepancy
-# sequence (against grating lobes), then the columns drawn in by a power. The constants come from one search;
-# the tests hold the result.
+# Placement of 56 microphones: 7 staggered rows of 8. A low-discrepancy sequence shifts each microphone
+# (against grating lobes), and a power law moves the columns inwards. The constants were found by one search;
+# tests check the result.
 _COLUMNS, _ROWS = 8, 7
 _WIDTH_M, _HEIGHT_M = 0.78, 0.65
 _JITTER = 0.57
@@ -73,23 +73,23 @@ class MicrophoneArray:
 
     .. math:: \tau_m(\theta, \phi) = -p_m^T u(\theta, \phi) / c
 
-    relative to the origin of the coordinates. Only differences of delays matter, so the origin is free.
+    relative to the origin. Only differences of delays are used, so the origin is arbitrary.
 
     Parameters
     ----------
     positions_m : array_like, shape (M, 3)
-        Coordinates in `base_link` axes (x forward, y left, z up), metres; 2 <= M <= 1024, at least .1 mm
+        Coordinates in `base_link` axes (x forward, y left, z up), metres; 2 <= M <= 1024, at least 0.1 mm
         apart. The order is that of the audio channels.
     name : str
-        How messages call it.
+        Name in messages.
     channels : tuple of int
-        Channel of each microphone, from 1, where a recording has others beside them; none by default.
+        Channel of each microphone, from 1, if a recording has further channels; none by default.
 
     Raises
     ------
     InvalidArgumentError
-        On another shape, numbers that are not finite, or two microphones at one place, which the message
-        names, counted from 1; if `channels` does not name a channel of its own for every microphone.
+        On another shape, numbers that are not finite or two microphones at one place (the message gives their
+        numbers, from 1), or if `channels` does not have a different channel for every microphone.
 
     Examples
     --------
@@ -134,7 +134,7 @@ class MicrophoneArray:
         return np.asarray(self.positions_m - self.positions_m.mean(axis=0))
 
     def nearest(self, keep: BoolArray | None = None) -> IndexArray:
-        """Channels from the centre outwards: those kept (M,), or all where none is."""
+        """Return channels from the centre outwards: those kept (M,), or all if none is kept."""
         order = np.argsort(np.linalg.norm(self.centred_m, axis=1), kind="stable")
         return order if keep is None or not keep.any() else order[keep[order]]
 
@@ -164,14 +164,14 @@ class MicrophoneArray:
         return float(nearest_spacings_m(self.positions_m).mean())
 
     def alias_hz(self) -> float:
-        """Return the frequency to which the mean spacing d samples every direction without aliasing, Hz.
+        r"""Return the frequency below which the mean spacing d causes no aliasing in any direction, Hz.
 
         .. math:: f = c / (2 d)
 
         Returns
         -------
         float
-            Hz.
+            Frequency in Hz.
 
         References
         ----------
@@ -187,22 +187,22 @@ class MicrophoneArray:
 
     @property
     def ambiguity(self) -> Ambiguity:
-        r"""Directions that an array of this shape cannot distinguish, whatever the algorithm.
+        r"""Directions that an array of this shape cannot distinguish with any algorithm.
 
-        With the singular values :math:`s_1 \ge s_2 \ge s_3` of the centred positions and n the direction of
-        the last, an array is linear for :math:`s_2 < 10^{-3} s_1` and else planar for
-        :math:`s_3 < 10^{-3} s_1`, across the road for :math:`|n_x| > 0.985` and flat for
-        :math:`|n_z| > 0.985`.
+        With the singular values :math:`s_1 \ge s_2 \ge s_3` of the centred positions and the direction n of
+        the last, an array is linear for :math:`s_2 < 10^{-3} s_1` and otherwise planar for
+        :math:`s_3 < 10^{-3} s_1`. A planar array is across the road for :math:`|n_x| > 0.985` and horizontal
+        for :math:`|n_z| > 0.985`.
 
         Examples
         --------
         >>> MicrophoneArray([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]]).ambiguity
         'front-back'
         """
-        # A linear array measures the angle to its axis only (`cone`). A planar one does not distinguish a
+        # A linear array only measures the angle to its axis (`cone`). A planar array cannot distinguish a
         # direction from its mirror image in the array plane: `front-back` if the plane is across the road,
         # `up-down` if it is horizontal, `mirror` if it is tilted or faces sideways. A three-dimensional array
-        # has no mirror direction.
+        # has no ambiguity.
         spread, axes = np.linalg.svd(self.centred_m, full_matrices=True)[1:]
         thickness = np.pad(spread, (0, 3 - len(spread)))
         if thickness[1] < _FLAT * thickness[0]:
@@ -227,7 +227,7 @@ class MicrophoneArray:
         Returns
         -------
         ndarray, shape (..., M)
-            Seconds; negative at microphones nearer to the source than the origin.
+            Seconds; negative at microphones closer to the source than the origin.
 
         References
         ----------
@@ -251,14 +251,14 @@ class MicrophoneArray:
         Parameters
         ----------
         frequencies_hz : array_like, shape (F,)
-            Hz.
+            Frequencies in Hz.
         azimuths_rad, elevations_rad : array_like, broadcast to shape (D,)
             Azimuth, left positive, and elevation, up positive, radians.
 
         Returns
         -------
         ndarray of complex128, shape (F, M, D)
-            Of modulus one.
+            Values of modulus one.
 
         References
         ----------
@@ -278,13 +278,13 @@ def roof_array_56() -> MicrophoneArray:
     """Return a roof array of 56 microphones in the y-z plane, across the vehicle, centred at the origin.
 
     It has the dimensions of the array in the paper (section IV): aperture 0.78 m x 0.65 m, S_xx = 3.03 m^2,
-    mean nearest spacing 8.8 cm, hence alias-free to about 1.9 kHz. The positions themselves are this
+    mean nearest spacing 8.8 cm. It is therefore alias-free up to about 1.9 kHz. The positions are this
     library's own.
 
     Returns
     -------
     MicrophoneArray
-        The same each time.
+        The same array on each call.
 
     Examples
     --------
@@ -308,15 +308,15 @@ def _to_unit(values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelMask:
-    r"""Microphones that are used.
+    r"""Selection of microphones.
 
-    A whitened channel that is set to zero adds nothing to a sum over microphones, so that the beams of the
-    whole array serve for any part of it. Only the scale changes: with n of M microphones, beam power is
-    smaller by (n / M)^2 and the sum over pairs by n (n - 1) / (M (M - 1)). Sums are scaled back per hop, so
-    that a window may hold hops with different masks.
+    A whitened channel that is set to zero adds nothing to a sum over microphones, so the beams of the whole
+    array also serve for a part of it. Only the scale changes: with n of M microphones, beam power is smaller
+    by (n / M)^2 and the sum over pairs by n (n - 1) / (M (M - 1)). Sums are rescaled per hop, so a window may
+    contain hops with different masks.
     """
 
-    keep: BoolArray  # shape (M,): False for those left out
+    keep: BoolArray  # shape (M,): False for excluded microphones
 
     @classmethod
     def all_of(cls, n_channels: int) -> "ChannelMask":
@@ -335,7 +335,7 @@ class ChannelMask:
 
     @property
     def power_scale(self) -> float:
-        """(M / n)^2: from the beam power of n microphones to that of M; finite for none."""
+        """(M / n)^2: converts the beam power of n microphones to that of M; finite for none."""
         return float((len(self.keep) / max(self.n_kept, 1)) ** 2)
 
     @property
@@ -345,7 +345,7 @@ class ChannelMask:
         return whole * (whole - 1) / (kept * (kept - 1))
 
     def silence(self, spectra: Complex64Array) -> None:
-        """Set the channels left out of spectra (..., M) to zero, in place."""
+        """Set the excluded channels of spectra (..., M) to zero, in place."""
         if not self.is_whole:
             spectra[..., ~self.keep] = 0.0
 
@@ -354,8 +354,8 @@ class ChannelMask:
         return matrices if self.is_whole else np.asarray(matrices * (self.keep[:, None] & self.keep))
 
 
-# (y, z) in metres, in the order of OVAD's channels; x is zero. Facts released with Schulz et al. 2021, there
-# in axes that grow to the right and up; no digit is rounded.
+# (y, z) in metres, in the order of OVAD's channels; x is zero. Released with Schulz et al. 2021 in axes that
+# point right and up; no digit is rounded.
 # fmt: off
 _LEFT_UP_M = (
     (0.392, 0.288), (0.289024, 0.328443), (0.303659, 0.217809), (0.212195, 0.258831), (0.392, 0.128308),
@@ -376,16 +376,16 @@ _LEFT_UP_M = (
 
 
 def ovad_array() -> MicrophoneArray:
-    """Return the array that OVAD was recorded with: 56 microphones in the y-z plane, across the vehicle.
+    """Return the array of the OVAD recordings: 56 microphones in the y-z plane, across the vehicle.
 
     Its positions were released with Schulz et al., "Hearing What You Cannot See: Acoustic Vehicle Detection
-    Around Corners", 2021. It is the default wherever a recording in OVAD's layout names no array of its own,
-    and what the simulator listens with.
+    Around Corners", 2021. It is the default for recordings in OVAD's layout without an array of their own and
+    for the simulator.
 
     Returns
     -------
     MicrophoneArray
-        In the order of OVAD's channels; the same each time.
+        Microphones in the order of OVAD's channels; the same array on each call.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Steering matrices for many directions, factored where few dimensions suffice; products on one thread."""
+"""Steering matrices for many directions, factorised if the rank is small; products run on one thread."""
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from worldstate.ground.typing import Complex64Array, Complex128Array, FloatArray
 
 from .microphone_array import MicrophoneArray
 
-# Largest errors by interpolation, relative to the largest possible power, and of a steering vector by the
-# factors, relative to its length: those of single precision.
+# Largest errors of the interpolated power relative to the largest possible power, and of a factorised
+# steering vector relative to its length: those of single precision.
 _POWER_TOLERANCE, _TOLERANCE = 1e-7, 1e-6
 
 
@@ -32,15 +32,15 @@ class Steering:
     (3, True)
     """
 
-    # Beams over azimuth at one elevation, below the alias frequency, span few of the M dimensions (15 to 20
-    # of 56), so that B (M x r) and C (r x directions) cost a third of W = B C.
+    # Below the alias frequency, beams over azimuth at one elevation span few of the M dimensions (15 to 20 of
+    # 56). Products with B (M x r) and C (r x directions) then take a third of the time of W = B C.
 
-    # shape (bins, M, r): Orthonormal columns; None if the factors would be no smaller than the weights.
+    # shape (bins, M, r): Orthonormal columns; None if the factors would not be smaller than the weights.
     basis: Complex64Array | None
     weights: Complex64Array  # shape (bins, r or M, directions): C and its conjugate
     conjugate: Complex64Array
-    # The same beams at the node directions from which the power in all others is interpolated, and how,
-    # shape (nodes, directions); None if that does not save work.
+    # The same beams in the node directions, and the weights (nodes, directions) with which the power in all
+    # directions is interpolated from them; None if this saves no time.
     nodes: "tuple[Steering, FloatArray] | None" = None
 
     @classmethod
@@ -51,7 +51,7 @@ class Steering:
         azimuths_rad: ArrayLike,
         elevations_rad: ArrayLike = 0.0,
     ) -> "Steering":
-        r"""Build the beams of an array at the given frequencies and directions.
+        r"""Return the beams of an array at the given frequencies and directions.
 
         .. math:: W_k = \overline{A_k}, \qquad W_k \approx B_k C_k, \quad C_k = B_k^H W_k
 
@@ -63,7 +63,7 @@ class Steering:
         return _beams(*(one.tobytes() for one in (array.centred_m, frequencies, azimuths, elevations)))
 
     def covariance(self, spectra: Complex64Array) -> Complex64Array:
-        r"""Sum x x^H over frames in coordinates of the basis, (frames, bins, M) -> (bins, r, r).
+        r"""Return the sum of x x^H over frames in the basis, (frames, bins, M) -> (bins, r, r).
 
         .. math:: Q_k = \sum_t (B_k^T x_{t,k}) (B_k^T x_{t,k})^H
         """
@@ -71,13 +71,13 @@ class Steering:
         return cross_spectra(by_bin if self.basis is None else by_bin @ self.basis)
 
     def compress(self, matrices: Complex64Array) -> Complex64Array:
-        r"""Write R as :math:`Q_k = B_k^T R_k \overline{B_k}` in the basis: (bins, M, M) -> (bins, r, r)."""
+        r"""Return R in the basis, :math:`Q_k = B_k^T R_k \overline{B_k}`: (bins, M, M) -> (bins, r, r)."""
         if self.basis is None:
             return matrices
         return np.asarray(self.basis.transpose(0, 2, 1) @ (matrices @ self.basis.conj()))
 
     def quadratic_form(self, matrices: Complex64Array) -> Complex128Array:
-        r"""Sum quadratic forms of the beams over bins, (bins, r, r) -> (directions,).
+        r"""Return the sum of the beams' quadratic forms over bins, (bins, r, r) -> (directions,).
 
         .. math:: P(\theta) = \sum_k C_k(\theta)^T Q_k\, \overline{C_k(\theta)}
         """
@@ -88,7 +88,7 @@ class Steering:
         return np.asarray(products.sum(axis=(0, 1)), dtype=np.complex128)
 
     def power_within(self, vectors: Complex64Array) -> FloatArray:
-        r"""Return the power of steering vectors within orthonormal columns (bins, M, k): (bins, directions).
+        r"""Return the power of steering vectors in the span of columns (bins, M, k): (bins, directions).
 
         .. math:: p_k(\theta) = \|E_k^H a_k(\theta)\|^2
         """
@@ -100,11 +100,11 @@ class Steering:
         return np.asarray(power)
 
 
-# Every stream of an array needs the same two sets of beams, and they are nine tenths of the 50 ms that a
-# front-end for 56 microphones takes to make. Few are kept: a set for 1024 microphones holds 15 MB.
+# Every stream of an array uses the same two sets of beams, whose computation takes nine tenths of the 50 ms
+# to create a front-end for 56 microphones. Few sets are cached: one for 1024 microphones needs 15 MB.
 @lru_cache(maxsize=4)
 def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: bytes) -> Steering:
-    """Build the beams of `Steering.towards` from the bytes of its arguments, which can be compared."""
+    """Return the beams of `Steering.towards` from the bytes of its arguments, which can be cache keys."""
     array = MicrophoneArray(np.frombuffer(centred).reshape(-1, 3))
     frequencies_hz, azimuths_rad, elevations_rad = map(np.frombuffer, (frequencies, azimuths, elevations))
     weights = array.steering(frequencies_hz, azimuths_rad, elevations_rad).conj()
@@ -121,17 +121,17 @@ def _beams(centred: bytes, frequencies: bytes, azimuths: bytes, elevations: byte
 
 
 def interpolation_nodes(vectors: Complex128Array) -> tuple[IndexArray, FloatArray] | None:
-    r"""Choose nodes N among the directions of steering vectors (bins, M, directions), and their weights.
+    r"""Select nodes N among the directions of steering vectors (bins, M, directions), with their weights.
 
     .. math:: P(\theta) = \sum_n P(\theta_n)\, s_n(\theta), \qquad s = G_{NN}^{-1} G_{N\theta}, \qquad
               G(\theta, \phi) = \sum_k \big| a_k(\theta)^H a_k(\phi) \big|^2
 
-    A quadratic form :math:`P = \sum_k a_k(\theta)^H Q_k\, a_k(\theta)` is a smooth function of the direction,
-    whatever the Q_k: below the alias frequency of an array it lies in a space of some thirty dimensions,
-    however fine the grid. The nodes follow from a pivoted Cholesky factorisation of G (N. J. Higham,
-    "Analysis of the Cholesky decomposition of a semi-definite matrix", 1990): each where the ones before
-    predict the power worst, until all are predicted; None if more than half of the directions would be
-    needed.
+    A quadratic form :math:`P = \sum_k a_k(\theta)^H Q_k\, a_k(\theta)` is a smooth function of the direction
+    for any Q_k. Below the alias frequency of an array it lies in a space of about thirty dimensions, however
+    fine the grid is. The nodes follow from a pivoted Cholesky factorisation of G (N. J. Higham, "Analysis of
+    the Cholesky decomposition of a semi-definite matrix", 1990). Each node is the direction with the largest
+    prediction error from the previous ones, until all directions are predicted. The result is None if more
+    than half of the directions would be needed.
     """
     count = vectors.shape[2]
     rest = np.square(np.square(np.abs(vectors)).sum(axis=1)).sum(axis=0)
@@ -149,14 +149,14 @@ def interpolation_nodes(vectors: Complex128Array) -> tuple[IndexArray, FloatArra
 
 
 def _kernel(vectors: Complex128Array, index: int) -> FloatArray:
-    """G between one direction and all, (directions,)."""
+    """Return G between one direction and all, (directions,)."""
     inner = (vectors[:, None, :, index].conj() @ vectors)[:, 0]
     return np.asarray((np.square(inner.real) + np.square(inner.imag)).sum(axis=0))
 
 
 def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | None:
-    """Orthonormal columns (bins, M, r) that span all weights to the tolerance; None if too many."""
-    # Gram-Schmidt with pivoting: the vector with the largest remainder gives the next column.
+    """Return orthonormal columns (bins, M, r) that span all weights to the tolerance; None if too many."""
+    # Gram-Schmidt with pivoting: the vector with the largest remainder becomes the next column.
     remainder = weights.copy()
     columns: list[Complex128Array] = []
     limit = _TOLERANCE * np.sqrt(weights.shape[1])
@@ -167,7 +167,7 @@ def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | No
         if length.max() < limit:
             return np.stack(columns, axis=2)
         column = np.take_along_axis(remainder, worst[:, None], axis=2)[:, :, 0]
-        # A bin that is complete gets a column of zeros.
+        # A bin that is complete receives a column of zeros.
         column = np.where(length < limit, 0.0, column / np.maximum(length, limit))
         columns.append(column)
         remainder -= column[:, :, None] * (column.conj()[:, None] @ remainder)
@@ -180,17 +180,17 @@ def cross_spectra(spectra: Complex64Array) -> Complex64Array:
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """Keep BLAS on the calling thread while inside; afterwards as it was."""
-    # The front-end multiplies thousands of small matrices a second. A second BLAS thread gains nothing there,
-    # and where other programs keep the processor busy every product would wait for it to be scheduled
-    # (measured on two busy cores: four times the processor time). It also keeps results the same bit for bit
-    # on any number of cores. The limit is the process's: products that other threads of the host begin
-    # meanwhile, about a millisecond in a hundred, run on one thread too. It costs 16 microseconds.
+    """Limit BLAS to the calling thread in a context and restore the limit afterwards."""
+    # The front-end multiplies thousands of small matrices per second. A second BLAS thread does not
+    # accelerate these; if other programs use the processor, every product would wait until it is scheduled
+    # (four times the processor time on two busy cores). One thread also makes results bit-identical for any
+    # number of cores. The limit applies to the process: products that other threads start meanwhile, about
+    # one millisecond in a hundred, also run on one thread. The call takes 16 microseconds.
     several = any(library.get_num_threads() > 1 for library in _controller().lib_controllers)
     return _controller().limit(limits=1) if several else nullcontext()
 
 
 @lru_cache(maxsize=1)
 def _controller() -> Any:
-    """Look for the libraries once: that costs a millisecond."""
+    """Return the controller of the BLAS libraries; cached, because the search takes a millisecond."""
     return ThreadpoolController().select(user_api="blas")

@@ -5,25 +5,27 @@ The steered response power after the phase transform over T frames, K bins and M
 .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k}
           \Big| \sum_m \overline{a_{k,m}(\theta)}\, \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2,
 
-is 1 for a single plane wave from theta, 1/M for noise that is independent between microphones. The SRP of
+is 1 for a single plane wave from theta and 1/M for noise that is independent between microphones. The SRP of
 pyroomacoustics is M^2 / pairs = 2 M / (M - 1) times as large.
 
-A spatial spectrum has several peaks, and the highest is not always the source: noise adds to one, walls
-reflect. What decides is the power of the wave over that of all the rest,
+A spatial spectrum has several peaks, and because of noise and reflections the highest peak is not always the
+source. The accuracy depends on the ratio of the wave's power to the remaining power,
 
 .. math:: \gamma = \frac{\hat P - \bar P}{1 - \hat P}, \qquad \bar P = \mathrm{median}_\theta P.
 
-Within the lobe L of the peak, of width w by the curvature of its top, the rest moves the top by a share of w,
-and the chance that another direction is the right one falls exponentially with what it lacks:
+Within the lobe L of the peak, whose width w follows from its curvature, the remaining power displaces the
+peak by a part of w. The probability of another direction falls exponentially with its distance from the
+peak's power:
 
 .. math:: \sigma^2 = \sigma_0^2 + \Big(\frac{c\, w}{\gamma}\Big)^2
           + \frac{\int_{\theta \notin L} (\theta - \hat\theta)^2 q\, d\theta}{\int q\, d\theta}, \qquad
           w^2 = \frac{\hat P - \bar P}{|P''(\hat\theta)|}, \qquad
           q = \exp \frac{(P - \hat P)_{P > \bar P}}{\tau\, (1 - \hat P)},
 
-with c = .024, tau = .0125 and sigma_0 = 1 degree. A peak no higher than that of noise (`noise_prominence`)
-has no direction: Delta / sqrt(12) of the span Delta of the search. That of an image in a wall is as high and
-as sharp as any, which no spectrum shows; a stream of bearings does: see `BearingScatter`.
+with c = 0.024, tau = 0.0125 and sigma_0 = 1 degree. A peak that is not higher than peaks of noise
+(`noise_prominence`) has no direction; its deviation is Delta / sqrt(12) for the span Delta of the search. A
+reflection in a wall has an equally high and sharp peak, so a single spectrum does not reveal it, but a
+sequence of bearings does: see `BearingScatter`.
 """
 
 import math
@@ -44,7 +46,7 @@ _TINY = np.finfo(np.float64).tiny
 
 
 def steered_power(whitened: Complex64Array, steering: Steering) -> FloatArray:
-    r"""Sum the beam powers over frames and bins, the part of SRP that adds up over a running window.
+    r"""Return the sum of the beam powers over frames and bins, which can be updated in a running window.
 
     .. math:: S(\theta) = \sum_{t,k} \Big| \sum_m \overline{a_{k,m}(\theta)}\, Z_{t,k,m} \Big|^2
 
@@ -76,7 +78,7 @@ def steered_power(whitened: Complex64Array, steering: Steering) -> FloatArray:
 
 
 def normalised(total: FloatArray, n_frames: int, n_bins: int, n_microphones: int) -> FloatArray:
-    r"""Scale a sum of beam powers to 0..1; negative round-off is set to zero.
+    r"""Scale a sum of beam powers to 0..1; negative rounding errors become zero.
 
     .. math:: P(\theta) = \frac{\max(S(\theta), 0)}{T K M^2}
 
@@ -91,7 +93,7 @@ def normalised(total: FloatArray, n_frames: int, n_bins: int, n_microphones: int
 
 
 def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
-    r"""Compute SRP-PHAT of a set of frames: 1 for a single plane wave, 1/M for independent noise.
+    r"""Return the SRP-PHAT of a set of frames: 1 for a single plane wave, 1/M for independent noise.
 
     .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k}
               \Big| \sum_m \overline{a_{k,m}(\theta)}\, \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2
@@ -106,7 +108,7 @@ def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
     Returns
     -------
     ndarray of float64, shape (directions,)
-        Between 0 and 1.
+        Power between 0 and 1.
 
     Raises
     ------
@@ -132,9 +134,9 @@ def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
     return normalised(steered_power(whiten(spectra), steering), n_frames, n_bins, n_microphones)
 
 
-# What three deviations reach in all directions together is called noise only up to this share of its excess:
-# a vehicle in view, heard by 4 microphones, has a lower peak in a quarter of the hops, and a bearing of
-# noise that is let through states 50 degrees, for it has many peaks.
+# Only this share of the excess that noise reaches with three deviations over all directions counts as noise.
+# The peak of a visible vehicle is below the full excess in a quarter of the hops with 4 microphones, and an
+# accepted bearing of noise has a stated deviation of 50 degrees, because noise has many peaks.
 _DEVIATIONS, _SHARE = 3.0, 0.6
 _ALL_ROUND_RAD = np.radians(np.arange(-180.0, 180.0, 10.0))
 
@@ -142,11 +144,11 @@ _ALL_ROUND_RAD = np.radians(np.arange(-180.0, 180.0, 10.0))
 def noise_prominence(
     rows: Sequence[Steering], array: MicrophoneArray, frequencies_hz: FloatArray, n_frames: float
 ) -> float:
-    r"""Return the peak-to-median ratio up to which a peak is taken for noise.
+    r"""Return the peak-to-median ratio below which a peak is considered noise.
 
-    Sound that comes from all horizontal directions alike is the noise of a street whose spectrum is least
-    flat. After the phase transform the power of a beam in a frame and bin is about exponentially distributed,
-    so that the mean over T frames and K bins scatters by epsilon:
+    Sound that arrives equally from all horizontal directions is the street noise with the least flat
+    spectrum. After the phase transform, the power of a beam in a frame and bin is approximately exponentially
+    distributed, so the mean over T frames and K bins has the relative deviation epsilon:
 
     .. math:: D(\theta) = \frac{1}{K} \sum_k d_k(\theta), \qquad
               d_k(\theta) = \Big\langle \frac{|a_k(\theta)^H a_k(\phi)|^2}{M^2} \Big\rangle_\phi, \qquad
@@ -157,7 +159,7 @@ def noise_prominence(
     horizon = array.steering(frequencies_hz, _ALL_ROUND_RAD).astype(np.complex64)
     by_row = np.array([row.power_within(horizon) / horizon.shape[2] for row in rows])
     diffuse = by_row.mean(axis=1).max(axis=0)
-    # Of the last row: rows differ little in how their bins share the power.
+    # Computed from the last row, because the rows have similar ratios between their bins.
     scatter = np.linalg.norm(by_row[-1], axis=0) / (np.sqrt(n_frames) * by_row[-1].sum(axis=0))
     reached = diffuse.max() / np.median(diffuse) * (1.0 + _DEVIATIONS * scatter.max())
     return float(1.0 + _SHARE * (reached - 1.0))
@@ -174,7 +176,7 @@ class Peak:
     azimuth_rad : float
         Azimuth at the interpolated maximum, radians, left positive.
     value : float
-        Height there, in the unit of the spectrum.
+        Height at the maximum, in the unit of the spectrum.
     prominence : float
         Peak-to-median ratio, >= 1 for the highest peak.
 
@@ -198,12 +200,12 @@ def find_peaks(values: FloatArray, azimuths_rad: FloatArray, max_peaks: int = 4)
               \hat\theta = \theta_i + \delta\, \Delta\theta, \qquad
               \hat P = P_i - \tfrac14 (P_{i-1} - P_{i+1})\, \delta.
 
-    A spectrum of zeros (silence) has no peak. A maximum at an end of the grid is not interpolated.
+    A zero spectrum (silence) has no peak. A maximum at an end of the grid is not interpolated.
 
     Parameters
     ----------
     values : ndarray, shape (A,)
-        The spectrum, non-negative, any unit; it is not checked.
+        The spectrum, non-negative, in any unit; it is not checked.
     azimuths_rad : ndarray, shape (A,)
         Ascending, evenly spaced, radians; A >= 2.
     max_peaks : int
@@ -236,15 +238,15 @@ def find_peaks(values: FloatArray, azimuths_rad: FloatArray, max_peaks: int = 4)
 
 
 def is_all_round(azimuths_rad: FloatArray) -> bool:
-    """Return whether a grid (A,) ends where it begins."""
+    """Return whether a grid (A,) covers a full circle."""
     step = azimuths_rad[1] - azimuths_rad[0]
     return bool(azimuths_rad[-1] - azimuths_rad[0] >= 2.0 * math.pi - 0.5 * step)
 
 
 def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a spectrum (A,) all round, and its grid, cut open behind its peak; any other as it is.
+    """Return a full-circle spectrum (A,) and its grid, opened opposite the peak; other spectra unchanged.
 
-    Where the search begins and ends is the same direction: a source there has one peak, not half of two.
+    The first and the last direction of a full circle are the same, so a source there has one peak.
 
     Examples
     --------
@@ -261,7 +263,7 @@ def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatA
 
 
 def _local_maxima(values: FloatArray) -> IndexArray:
-    """Return the indices of local maxima; of a plateau the first."""
+    """Return the indices of local maxima; for a plateau the first index."""
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     return ((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:])).nonzero()[0]
 
@@ -276,11 +278,12 @@ def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: f
     return Peak(azimuth if abs(azimuth) <= math.pi else wrap_angle(azimuth), height, height / median)
 
 
-# Fitted with _APART to sources in rooms and in the open on rings of 4 to 8 microphones, 3 to 10 cm, and to
-# vehicles in view in simulated streets heard by 56, 14, 7 and 4, by the Gaussian likelihood of the errors.
+# Fitted together with _APART by the Gaussian likelihood of the errors: sources in rooms and in the open with
+# rings of 4 to 8 microphones, 3 to 10 cm, and visible vehicles in simulated streets with 56, 14, 7 and 4
+# microphones.
 _DISPLACEMENT, _TEMPERATURE = 0.024, 0.0125
-# Elevations between the two that are searched move the azimuth of an array that is not level: lone waves on
-# arrays drawn at random are off by 1.1 degrees. And the least rest, where rounding would decide.
+# Elevations between the two of the search displace the azimuth of an array that is not horizontal: single
+# waves at random arrays have errors of 1.1 degrees. Also the least remaining power, to avoid rounding errors.
 _LEAST_STD_RAD, _LEAST_REST = float(np.radians(1.0)), 1e-3
 
 
@@ -294,14 +297,14 @@ class AcousticBearing:
 
 
 def uniform_std_rad(azimuths_rad: FloatArray) -> float:
-    """Return the standard deviation of a direction that may be anywhere on a grid."""
+    """Return the standard deviation of an unknown direction on a grid."""
     return float(azimuths_rad[-1] - azimuths_rad[0]) / math.sqrt(12.0)
 
 
 def bearing_of(
     spectrum: FloatArray, peaks: Sequence[Peak], azimuths_rad: FloatArray, least_prominence: float
 ) -> AcousticBearing:
-    """Return the first of the peaks of a spectrum (A,) as a bearing; the middle of the grid if none."""
+    """Return the first peak of a spectrum (A,) as a bearing; without peaks, the middle of the grid."""
     uniform = uniform_std_rad(azimuths_rad)
     if not peaks:
         return AcousticBearing(float(0.5 * (azimuths_rad[0] + azimuths_rad[-1])), uniform, 1.0)
@@ -317,7 +320,7 @@ def _std_rad(spectrum: FloatArray, best: Peak, azimuths_rad: FloatArray) -> floa
     excess = np.maximum(spectrum / share - 1.0 / (best.prominence - 1.0), 0.0)
     density = np.exp((excess - excess[peak]) * (ratio / _TEMPERATURE))
     density /= density.sum()
-    # Within the peak's own lobe nothing is another direction.
+    # Within the peak's own lobe there is no other direction.
     density[peak - _width(excess[peak::-1]) : peak + _width(excess[peak:]) + 1] = 0.0
     others = float(density @ np.square(wrap_angle(azimuths_rad - best.azimuth_rad)))
     moved = _DISPLACEMENT * _top_width(excess, peak) * float(azimuths_rad[1] - azimuths_rad[0]) / ratio
@@ -325,18 +328,19 @@ def _std_rad(spectrum: FloatArray, best: Peak, azimuths_rad: FloatArray) -> floa
 
 
 def _top_width(excess: FloatArray, peak: int) -> float:
-    """Return the width of a parabola of height one on a peak, in steps; infinite at an end of the grid."""
+    """Return the width of the parabola through a peak, in grid steps; infinite at an end of the grid."""
     fall = 3.0 * excess[peak] - excess[peak - 1 : peak + 2].sum()
     return 1.0 / math.sqrt(fall) if 0 < peak < len(excess) - 1 and fall > 0.0 else math.inf
 
 
-# Hops; the memory is half a minute. Without the spread in the weights a few sharp bearings that agree, as of
-# an image in a wall, outweigh all that contradict: streets are off by 1.2 times what is stated instead of .9.
+# Number of hops between compared bearings; memory of half a minute; spread. Without the spread, a few sharp
+# and consistent bearings, such as those of a reflection, outweigh all contradicting ones: the errors in
+# streets are then 1.2 times the stated deviation (0.9 times with it).
 _APART, _KEEP, _SPREAD_RAD = 5, math.exp(-1.0 / 300.0), float(np.radians(10.0))
 
 
 class BearingScatter:
-    r"""How far the bearings of a stream contradict one another, as where walls reflect.
+    r"""Contradiction between the bearings of a stream, for example due to reflections.
 
     .. math:: \sigma_k'^2 = \sigma_k^2 + \frac{\sum_{j \le k} a^{k-j} w_j (\theta_j - \theta_{j-5})^2}
               {\sum_{j \le k} a^{k-j} w_j}, \qquad
@@ -355,7 +359,7 @@ class BearingScatter:
         self._past: deque[AcousticBearing] = deque(maxlen=_APART)
 
     def widened(self, bearing: AcousticBearing) -> AcousticBearing:
-        """Take the next bearing; return it with what the stream adds to its standard deviation."""
+        """Add the next bearing; return it with a standard deviation that includes the contradictions."""
         if len(self._past) == _APART:
             before = self._past[0]
             weight = 1.0 / (bearing.std_rad**2 + before.std_rad**2 + _SPREAD_RAD**2)
@@ -369,27 +373,28 @@ class BearingScatter:
 
 
 def _width(side: FloatArray) -> int:
-    # Where two rows of elevation cross, a lobe may rise a little above half its height.
+    # Where two rows of elevation intersect, a lobe may rise slightly above half its height.
     later, before = side[1:], side[:-1]
     ends = (((later > before) & (before < 0.5 * side[0])) | (later == 0.0)).nonzero()[0]
     return int(ends[0]) if len(ends) else len(side) - 1
 
 
-# Simulated streets: of 4,500 hops of hidden, passed and distant vehicles none has .4 with 56, 7 or 4
-# microphones; of those with a vehicle in the open behind the ego a quarter has. Sources in the open, 10 dB
-# above ambience: .48 (4 microphones) to .67 (56) in nine of ten. Real windows of hidden vehicles: below .25.
+# Simulated streets: none of 4,500 hops with hidden, passed or distant vehicles reaches 0.4 with 56, 7 or 4
+# microphones; a quarter of the hops with a vehicle in the open behind the ego does. Sources in the open, 10
+# dB above the ambience, have 0.48 (4 microphones) to 0.67 (56) in nine of ten hops. Real windows of hidden
+# vehicles are below 0.25.
 _MIDDLE, _WIDTH = 0.4, 0.03
-# Height above the median, relative to the peak, of another that makes them two.
+# Height of a second peak above the median, relative to the first, from which there are two sources.
 _SECOND = 0.6
 
 
 def direct_probability(peaks: Sequence[Peak]) -> float:
-    r"""Return the probability that the highest peak is a source in the open, by how much is one plane wave.
+    r"""Return the probability that the highest peak is a source in the open, from its share of the power.
 
-    .. math:: s = \frac{\hat P - \bar P}{1 - \bar P}, \qquad P(direct) = \frac{1}{1 + e^{-(s - .4) / .03}}
+    .. math:: s = \frac{\hat P - \bar P}{1 - \bar P}, \qquad P(direct) = \frac{1}{1 + e^{-(s - 0.4) / 0.03}}
 
-    with the highest peak of SRP-PHAT and its median. Where walls reflect it, sound comes from many
-    directions.
+    with the highest peak of SRP-PHAT and its median. Reflected sound arrives from many directions and has a
+    small share.
 
     Examples
     --------

@@ -1,12 +1,12 @@
-r"""The published 60-value feature: pair sums after the phase transform, two segments x thirty azimuths.
+r"""The published feature of 60 values: pair sums after the phase transform, two segments x thirty azimuths.
 
 .. math:: F_s(\theta) = \frac{1}{T_s K P} \Big| \sum_{t \in s} \sum_k \sum_{i<j}
           \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta) \Big|,
           \qquad Z = X / |X|
 
 over the T_s frames of segment s, K bins of 50-1500 Hz and the P = M (M - 1) / 2 pairs: the modulus of a
-complex sum without the diagonal, between 0 and 1. Azimuths run from -90 to 90 degrees counted to the RIGHT,
-as in the released data: index 0 of each segment is +90 degrees, the far left, in this library's convention.
+complex sum without the diagonal, between 0 and 1. As in the released data, azimuths run from -90 to 90 degrees,
+positive to the RIGHT; index 0 of each segment is +90 degrees (far left) in this library's convention.
 """
 
 from functools import lru_cache
@@ -25,45 +25,47 @@ FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))
 """The published azimuths in this library's convention (left positive), in the published order."""
 FEATURE_AZIMUTHS_RAD.flags.writeable = False
 
-# The values of the released data. The released features were made with pyroomacoustics 0.3.1, whose sum is
-# not real: later releases of it return another scale, and a classifier fed with that transfers worse. The
-# modulus of the complex sum depends, by about one per cent, on the order of the microphones, which is that of
-# the array file.
+# Parameters of the released data. The released features were computed with pyroomacoustics 0.3.1, whose sum
+# is not real. Later releases return another scale, with which a classifier transfers less well. The modulus
+# of the complex sum depends by about one per cent on the order of the microphones, which is that of the array
+# file.
 FEATURE_BAND_HZ = (50.0, 1500.0)
 FEATURE_VERSION = "SRP-PHAT pairs 1"
-"""Version of the feature, kept in every model; another number whenever the values for a sound change."""
+"""Version of the feature, stored in every model; it changes whenever the values for a sound change."""
 FEATURE_NFFT = 512
-FEATURE_RATE_HZ = 47_998.0  # of the released sound
+FEATURE_RATE_HZ = 47_998.0  # Rate of the released sound
 _FULL_RATE_HZ = 48_000.0
 FEATURE_SEGMENTS = 2
-# Two per cent of the rate move the top of the band by a third of a bin.
+# Two per cent of the rate change the upper limit of the band by a third of a bin.
 RATE_TOLERANCE = 0.02
-# At 3 kHz the band would end at half the rate, where converters pass nothing any more.
+# At 3 kHz the band would end at half the rate, where converters suppress the signal.
 MOST_HALVINGS = 3
 LEAST_RATE_HZ = (1.0 - RATE_TOLERANCE) * _FULL_RATE_HZ / 2**MOST_HALVINGS
 
 
 def feature_nfft(sample_rate_hz: float) -> int:
-    r"""Return the frame length whose bins fall where the published ones do, else 512.
+    r"""Return the frame length with the frequencies of the published bins, or 512 if there is none.
 
-    .. math:: N = 512 / 2^k, \qquad |2^k f_s / 47\,998 - 1| \le .02, \quad k = 0, \ldots, 3
+    .. math:: N = 512 / 2^k, \qquad |2^k f_s / 47\,998 - 1| \le 0.02, \quad k = 0, \ldots, 3
 
     Examples
     --------
     >>> feature_nfft(47_998), feature_nfft(12_000), feature_nfft(6000), feature_nfft(16_000)
     (512, 128, 64, 512)
     """
-    # Only halvings, for which other sound is resampled. Frames of 170 samples at 16 kHz last as long to .4 %,
-    # but begin elsewhere: chances of an approach move by .05 in the median, as by a shift of 2 ms at 48 kHz.
+    # Only halvings; sound at other rates is resampled. Frames of 170 samples at 16 kHz have the same duration
+    # within 0.4 % but other start times, which changes the probability of an approach by 0.05 in the median,
+    # as a shift of 2 ms at 48 kHz does.
     halvings = round(np.log2(FEATURE_RATE_HZ / sample_rate_hz))
     fits = abs(2.0**halvings * sample_rate_hz / FEATURE_RATE_HZ - 1.0) <= RATE_TOLERANCE
     return FEATURE_NFFT >> halvings if fits and 0 <= halvings <= MOST_HALVINGS else FEATURE_NFFT
 
 
 def feature_rate_hz(sample_rate_hz: float) -> float:
-    """Return the rate that sound is brought to: its own where frames last as long as the published ones.
+    """Return the rate for the feature: the given one if its frames are as long as the published ones.
 
-    Otherwise it is the next higher of 12, 24 and 48 kHz, or 48; sound below 6 kHz is not mended by any.
+    Otherwise it is the next higher of 12, 24 and 48 kHz, at most 48 kHz. Below 6 kHz the rate is unchanged,
+    because resampling does not restore the band.
 
     Examples
     --------
@@ -80,7 +82,7 @@ def feature_rate_hz(sample_rate_hz: float) -> float:
 def feature_steering(
     array: MicrophoneArray, bins: range, sample_rate_hz: float, nfft: int = FEATURE_NFFT
 ) -> Steering:
-    r"""Return the beams at the thirty published azimuths.
+    r"""Return the beams in the thirty published azimuths.
 
     .. math:: w_k(\theta_i) = \overline{a_k(\theta_i)}, \qquad \theta_i = 90^\circ - i\, 180^\circ / 29
 
@@ -110,14 +112,14 @@ def pair_sum_of(
 
     .. math:: S(\theta) = \sum_k \sum_{i<j} \overline{a_{k,i}(\theta)}\, Q_{k,ij}\, a_{k,j}(\theta)
 
-    The channels are counted in `order`, or in that of the array.
+    The channels are in `order`, or in the order of the array by default.
     """
     pairs = matrices * _pairs_mask(order or tuple(range(matrices.shape[2])))
     return steering.quadratic_form(steering.compress(pairs))
 
 
 def segment_feature(sums: Complex128Array, n_frames: int, n_bins: int, n_microphones: int) -> FloatArray:
-    r"""Return the modulus of summed pair sums, per frame, bin and pair.
+    r"""Return the modulus of summed pair sums per frame, bin and pair.
 
     .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_s S_s(\theta) \Big|, \qquad P = M (M - 1) / 2
 
@@ -133,7 +135,7 @@ def segment_feature(sums: Complex128Array, n_frames: int, n_bins: int, n_microph
 
 
 def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz: float) -> FloatArray:
-    r"""Compute the published feature of one window, with its zero-padded edge frames as in the released data.
+    r"""Return the published feature of one window, with zero-padded edge frames as in the released data.
 
     .. math:: F_s(\theta) = \frac{1}{T_s K P} \Big| \sum_{t \in s} \sum_k \sum_{i<j}
               \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta) \Big|
@@ -143,14 +145,15 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     window : array_like, shape (n, M)
         About one second of sound, any unit; at least a frame of `feature_nfft` samples.
     array : MicrophoneArray
-        One microphone a channel, in the order of the channels.
+        One microphone per channel, in the order of the channels.
     sample_rate_hz : float
         Samples per second.
 
     Returns
     -------
     ndarray of float64, shape (60,)
-        Segment 1 at thirty azimuths from left to right, then segment 2. A last odd frame is left out.
+        Segment 1 at thirty azimuths from left to right, then segment 2. With an odd number of frames the last
+        one is omitted.
 
     Raises
     ------
@@ -187,7 +190,7 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
 
 @lru_cache(maxsize=8)
 def _pairs_mask(order: tuple[int, ...]) -> Float32Array:
-    """Return one where the row comes before the column in an order of the channels, else zero."""
+    """Return a mask that is 1 if the row precedes the column in an order of the channels, otherwise 0."""
     place = np.argsort(order)
     mask = (place[:, None] < place[None]).astype(np.float32)
     mask.flags.writeable = False

@@ -5,9 +5,9 @@ The weighted cross-correlation of a pair (i, j) over the observed bins is
 .. math:: R_{ij}(\tau) = \mathrm{Re} \sum_f \Psi(f)\, G_{ij}(f)\, e^{j 2\pi f \tau},
           \qquad G_{ij}(f) = \langle X_i X_j^* \rangle_{frames}
 
-with its maximum at the delay of microphone i after microphone j. The sum is band-limited and its derivatives
-are known in closed form, so that Newton steps find the peak between lags; a parabola through three lags is
-biased.
+with its maximum at the delay of microphone i relative to microphone j. The sum is band-limited and its
+derivatives have a closed form, so Newton steps find the peak between lags. A parabola through three lags
+would be biased.
 """
 
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from worldstate.ground.checks import finite_array, finite_complex, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import ComplexArray, FloatArray, IndexArray
 
-# Lags per period of the highest frequency: the nearest one is then pi/8 rad from the peak at most.
+# Lags per period of the highest frequency: the nearest lag is then at most pi/8 rad from the peak.
 LAGS_PER_PERIOD = 8
-# Newton steps converge quadratically from there.
+# From there, Newton steps converge quadratically.
 NEWTON_STEPS = 4
 
 
@@ -38,7 +38,8 @@ class PairDelays:
     delay_s : ndarray, shape (P,)
         Arrival at i minus arrival at j, seconds.
     peak : ndarray, shape (P,)
-        Height of the peak over its largest possible value, <= 1: near one for a single coherent source.
+        Height of the peak relative to its largest possible value, <= 1; near one for a single coherent
+        source.
 
     Examples
     --------
@@ -59,13 +60,13 @@ def all_pairs(microphones: int) -> IndexArray:
 
 
 def gcc_delays(spectra: ArrayLike, frequencies_hz: ArrayLike, max_delay_s: float) -> PairDelays:
-    r"""Estimate the delay of every pair, between samples, by generalised cross-correlation.
+    r"""Estimate the delay of every pair with sub-sample resolution by generalised cross-correlation.
 
     .. math:: \hat\tau_{ij} = \arg\max_{|\tau| \le \tau_{max}}
               \mathrm{Re} \sum_f \Psi(f)\, G_{ij}(f)\, e^{j 2\pi f \tau}
 
-    Cross-spectra are averaged over frames first, then weighted by :math:`\Psi = 1 / |G_{ij}|` (PHAT); with a
-    flat coherence that is maximum likelihood.
+    Cross-spectra are first averaged over frames and then weighted by :math:`\Psi = 1 / |G_{ij}|` (PHAT). With
+    a flat coherence this is the maximum-likelihood estimate.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ def gcc_delays(spectra: ArrayLike, frequencies_hz: ArrayLike, max_delay_s: float
     frequencies_hz : array_like, shape (bins,)
         Centre of each bin, Hz, ascending.
     max_delay_s : float
-        Largest delay to search, seconds; for microphones at distance d this is d / c.
+        Largest delay of the search, seconds; d / c for microphones at a distance d.
 
     Returns
     -------
@@ -84,7 +85,7 @@ def gcc_delays(spectra: ArrayLike, frequencies_hz: ArrayLike, max_delay_s: float
     Raises
     ------
     InvalidArgumentError
-        On wrong shapes or values, or a search range in which equally spaced bins repeat themselves
+        On wrong shapes or values, or if the search range exceeds half the period of equally spaced bins
         (max_delay_s >= 1 / (2 bin spacing)).
 
     References
@@ -119,7 +120,7 @@ def gcc_delays(spectra: ArrayLike, frequencies_hz: ArrayLike, max_delay_s: float
 
 
 def _peaks(cross: ComplexArray, frequencies: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
-    """Coarse search on a lag grid, then Newton steps held within one grid step of it."""
+    """Search on a lag grid, then refine by Newton steps within one grid step."""
     omega = 2.0 * np.pi * frequencies
     step = 1.0 / (LAGS_PER_PERIOD * frequencies[-1])
     half = int(np.ceil(limit / step))
@@ -141,6 +142,6 @@ def _newton_step(cross: ComplexArray, omega: FloatArray, delay: FloatArray) -> F
     steered = cross * np.exp(1j * delay[:, None] * omega)
     slope = -(steered.imag @ omega)
     curvature = -(steered.real @ omega**2)
-    # Outside the concave part of the peak a Newton step would move away from it.
+    # Outside the concave part of the peak, a Newton step would lead away from it.
     step = np.divide(slope, curvature, out=np.zeros_like(delay), where=curvature < 0)
     return np.asarray(delay - step)

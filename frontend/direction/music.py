@@ -1,7 +1,7 @@
 r"""Wideband MUSIC for any set of steering vectors, and the number of sources.
 
-In each bin the covariance of the microphones is split into k signal eigenvectors E_s and the noise subspace;
-the spectrum is the reciprocal of the part of a steering vector a outside the signal subspace,
+In each bin, the covariance of the microphones is split into k signal eigenvectors E_s and the noise subspace.
+The spectrum is the reciprocal of the part of a steering vector a outside the signal subspace,
 
 .. math::
     P(\theta) = \frac1B \sum_b \frac{1}{a_b^H (I - E_s E_s^H) a_b}.
@@ -27,7 +27,7 @@ class Subspace:
 
 
 def covariance(spectra: ArrayLike) -> ComplexArray:
-    r"""Average the spatial covariance over frames: :math:`R_b = \langle x_b x_b^H \rangle`.
+    r"""Return the spatial covariance averaged over frames: :math:`R_b = \langle x_b x_b^H \rangle`.
 
     Shapes: spectra (frames, bins, M).
     """
@@ -37,11 +37,11 @@ def covariance(spectra: ArrayLike) -> ComplexArray:
 
 
 def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
-    r"""Return the signal subspace from frames, by the smaller of two eigenproblems.
+    r"""Return the signal subspace from frames, using the smaller of two eigenproblems.
 
-    With fewer frames T than microphones M the non-zero eigenvalues of :math:`X X^H / T` (M x M) are those of
-    the Gram matrix :math:`X^H X / T` (T x T), and :math:`E_s = X V \Lambda^{-1/2} / \sqrt T`: exact, and (M /
-    T)^3 cheaper.
+    With fewer frames T than microphones M, the non-zero eigenvalues of :math:`X X^H / T` (M x M) are those of
+    the Gram matrix :math:`X^H X / T` (T x T), and :math:`E_s = X V \Lambda^{-1/2} / \sqrt T`. This is exact
+    and (M / T)^3 times cheaper.
 
     Shapes: spectra (frames, bins, M).
     """
@@ -61,7 +61,7 @@ def signal_subspace(spectra: ArrayLike, sources: int) -> Subspace:
 
 
 def music_spectrum(subspace: Subspace, steering: ArrayLike) -> FloatArray:
-    r"""Compute the MUSIC spectrum of a set of steering vectors, averaged over bins.
+    r"""Return the MUSIC spectrum of a set of steering vectors, averaged over bins.
 
     .. math:: P(\theta) = \frac1B \sum_b \frac{1}{\|a_b\|^2 - \|E_s^H a_b\|^2}
 
@@ -71,17 +71,17 @@ def music_spectrum(subspace: Subspace, steering: ArrayLike) -> FloatArray:
         Signal subspace of the same bins and microphones.
     steering : array_like of complex, shape (bins, M, D)
         :math:`a_{bm}(\theta) = e^{+j 2\pi f_b\, u(\theta) \cdot p_m / c}` for a plane wave from direction u,
-        so that X = S a with the STFT convention e^{-j 2 pi f t}; or any measured response.
+        so that X = S a with the STFT convention e^{-j 2 pi f t}; alternatively a measured response.
 
     Returns
     -------
     ndarray, shape (D,)
-        Positive, no unit. Bins are averaged as they are, so that those with the sharpest peaks dominate.
+        Positive, without a unit. Bins have equal weights, so bins with the sharpest peaks dominate.
 
     Raises
     ------
     InvalidArgumentError
-        If the steering set does not fit the subspace or is not finite.
+        If the steering vectors do not fit the subspace or are not finite.
 
     References
     ----------
@@ -98,7 +98,7 @@ def music_spectrum(subspace: Subspace, steering: ArrayLike) -> FloatArray:
     A = finite_complex("steering", steering, (E.shape[0], E.shape[1], None))
     norm = power(A).sum(axis=1)
     outside = norm - power(E.conj().transpose(0, 2, 1) @ A).sum(axis=1)
-    # Round-off may leave a tiny or negative remainder where the steering vector lies in the subspace.
+    # Rounding may leave a tiny or negative remainder for a steering vector in the subspace.
     floor = np.finfo(outside.dtype).eps * norm
     return np.asarray((1.0 / np.maximum(outside, floor).astype(np.float64)).mean(axis=0))
 
@@ -118,10 +118,10 @@ def _checked_spectra(spectra: ArrayLike) -> ComplexArray:
 def count_sources(eigenvalues: ArrayLike, frames: int) -> int:
     r"""Estimate the number of sources from the eigenvalues of one or more bins.
 
-    All criteria assume noise that is white across the microphones and independent frames. A real street has
-    neither: reflections are coherent with their source, wind and ego-noise are not white, overlapping frames
-    are not independent. The result is the number of plane waves that the noise model does not explain, not of
-    vehicles.
+    All criteria assume noise that is white across the microphones and independent frames. In a real street,
+    reflections are coherent with their source, wind and ego-noise are not white, and overlapping frames are
+    not independent. The result is therefore the number of plane waves that the noise model does not explain,
+    not the number of vehicles.
 
     With l_1 >= ... >= l_M the eigenvalues, T frames and a, g the arithmetic and geometric means of the M - k
     smallest,
@@ -129,20 +129,20 @@ def count_sources(eigenvalues: ArrayLike, frames: int) -> int:
     .. math::
         L(k) = T (M - k) \ln(a / g), \qquad \mathrm{MDL} = L + \tfrac12 k (2M - k) \ln T
 
-    is consistent and needs T > M, because the geometric mean of a singular covariance is zero. Where T <= 2 M
-    the criterion of Nadakuditi and Edelman takes its place, which compares the second moment of the smallest
-    eigenvalues with that of a Wishart matrix and holds for T < M too:
+    is consistent and requires T > M, because the geometric mean of a singular covariance is zero. For T <= 2
+    M it is replaced by the criterion of Nadakuditi and Edelman, which compares the second moment of the
+    smallest eigenvalues with that of a Wishart matrix and also holds for T < M:
 
     .. math::
         t_k = M \Big[ (M - k) \frac{\sum_{i>k} l_i^2}{(\sum_{i>k} l_i)^2} - 1 - \frac M T \Big], \qquad
         \mathrm{few} = \tfrac12 (T / M)^2 t_k^2 + 2 (k + 1).
 
-    Criteria are log-likelihoods, so those of several bins add (independent bins, one number of sources).
+    Criteria are log-likelihoods, so they are added over independent bins with the same number of sources.
 
     Parameters
     ----------
     eigenvalues : array_like, shape (M,) or (bins, M)
-        All M eigenvalues of each covariance, any order, >= 0; zeros included where T < M.
+        All M eigenvalues of each covariance, any order, >= 0, including zeros for T < M.
     frames : int
         Number T >= 2 of independent frames behind the covariance.
 
@@ -178,7 +178,7 @@ def count_sources(eigenvalues: ArrayLike, frames: int) -> int:
 
 
 def _description_length(values: FloatArray, k: int, frames: int) -> FloatArray:
-    """MDL of k sources, one per bin."""
+    """Return the MDL of k sources for each bin."""
     microphones = values.shape[1]
     noise = np.maximum(values[:, k:], np.finfo(float).tiny)
     misfit = frames * (microphones - k) * (np.log(noise.mean(axis=1)) - np.log(noise).mean(axis=1))
@@ -186,7 +186,7 @@ def _description_length(values: FloatArray, k: int, frames: int) -> FloatArray:
 
 
 def _moment_score(values: FloatArray, k: int, frames: int) -> FloatArray:
-    """Nadakuditi-Edelman score of k sources for complex data, one per bin."""
+    """Return the Nadakuditi-Edelman score of k sources for complex data, for each bin."""
     microphones = values.shape[1]
     noise = values[:, k:]
     total = np.maximum(noise.sum(axis=1), np.finfo(float).tiny)
