@@ -1,4 +1,4 @@
-"""Spatial spectra that another front-end computed, and one channel of sound: one `AcousticFrame` a hop."""
+"""Acoustic frames from spatial spectra of another front-end and one channel of sound."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ HALF_HOPS = WINDOW_HOPS // FEATURE_SEGMENTS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenSpectra:
-    r"""Pair sums of SRP-PHAT that were computed elsewhere, one row a hop of 0.1 s from the start.
+    r"""Pair sums of SRP-PHAT from another front-end, one row per hop of 0.1 s from the start.
 
     .. math:: F(\theta) = \frac{1}{T K P} \Big| \sum_{t,k} \sum_{i<j}
               \overline{a_{k,i}}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j} \Big|, \qquad P = M (M - 1) / 2
@@ -40,19 +40,19 @@ class GivenSpectra:
     Parameters
     ----------
     values : ndarray, shape (hops, azimuths)
-        In (0, 1]: the form of the published feature, without the diagonal.
+        Values in (0, 1] as in the published feature, without the diagonal.
     azimuths_rad : ndarray, shape (azimuths,)
-        Ascending, evenly spaced, left positive; from -90 to 90 degrees at least.
+        Ascending, evenly spaced, left positive; at least from -90 to 90 degrees.
     array : MicrophoneArray
-        The M microphones that they were computed from.
+        The M microphones of the spectra.
     hops : int
-        Each row is of so many hops, the last of which is its own: 1, or 5 for half of a window.
+        Number of hops that a row covers, up to its own: 1, or 5 for half a window.
 
     Raises
     ------
     InvalidArgumentError
-        If a value is out of range, the azimuths do not ascend over the sector ahead, or the hops of a row do
-        not divide half a window.
+        If a value is out of range, the azimuths do not ascend over the sector ahead, or `hops` is neither 1
+        nor 5.
 
     Examples
     --------
@@ -71,26 +71,27 @@ class GivenSpectra:
         freeze_arrays(self, values=(None, None), azimuths_rad=(None,))
         check_shape("values", self.values.shape, (None, len(self.azimuths_rad)))
         if not (np.diff(self.azimuths_rad) > 0.0).all() or np.ptp(self.azimuths_rad) < np.pi - 1e-6:
-            raise InvalidArgumentError("azimuths_rad: expected ascending ones from -90 to 90 degrees")
+            raise InvalidArgumentError("azimuths_rad: expected ascending values from -90 to 90 degrees")
         if not ((self.values > 0.0) & (self.values <= 1.0)).all():
             raise InvalidArgumentError("values: expected pair sums in (0, 1]")
         if self.hops not in (1, HALF_HOPS):
-            raise InvalidArgumentError(f"hops: expected 1 or {HALF_HOPS} a row, got {self.hops}")
+            raise InvalidArgumentError(f"hops: expected 1 or {HALF_HOPS} per row, got {self.hops}")
 
 
 class SpectrumFrontEnd:
-    r"""What `FrontEnd` computes from M channels, from given spectra and one channel.
+    r"""Front-end for given spectra and one channel, with the results of `FrontEnd`.
 
-    Feature, spectrum, bearing and prominence come from the spectra; levels, looming and character from the
-    sound. The spectrum is the pair sum F itself, which SRP-PHAT of many microphones comes near: its diagonal
-    adds 1 / M. The channels' health and the share that could be heard are not measured.
+    Feature, spectrum, bearing and prominence come from the spectra; levels, looming and character come from
+    the sound. The spectrum is the pair sum F, which is close to the SRP-PHAT of many microphones, whose
+    diagonal adds 1 / M. The health of channels and the usable share of the sound are not measured.
 
     Parameters
     ----------
     spectra : GivenSpectra
         Hop k of the sound is row k.
     sample_rate_hz : float
-        Of the sound; no resampling is done, so frames of `settings.nfft` must last as the published ones do.
+        Sample rate of the sound. It is not resampled, so frames of `settings.nfft` must be as long as the
+        published ones.
     settings : FrontEndSettings
         Frames, bands and stages; the azimuths are those of the spectra.
     start_ns : int
@@ -131,7 +132,7 @@ class SpectrumFrontEnd:
         self._energies: deque[float] = deque(maxlen=WINDOW_HOPS)
 
     def process(self, block: Float32Array) -> list[AcousticFrame]:
-        """Take samples (n, 1) of full scale 1; return one frame for every hop that has a spectrum.
+        """Process samples (n, 1) of full scale 1; return one frame for every hop with a spectrum.
 
         Raises
         ------
@@ -146,15 +147,15 @@ class SpectrumFrontEnd:
         return [frame for frame in frames if frame is not None]
 
     def finish(self) -> list[AcousticFrame]:
-        """Return nothing: no hop waits for later samples."""
+        """Return an empty list, because no hop waits for later samples."""
         return []
 
     def skip(self, lost_ns: int) -> None:
-        """Refuse lost sound: the rows of the spectra count from its first sample."""
-        raise InvalidArgumentError(f"lost_ns: expected sound without a loss beside spectra, got {lost_ns}")
+        """Raise an error, because the rows of the spectra refer to uninterrupted sound."""
+        raise InvalidArgumentError(f"lost_ns: expected uninterrupted sound with spectra, got {lost_ns}")
 
     def _noise_prominence(self) -> float:
-        """Return the ratio up to which a peak is noise, as `FrontEnd` computes it for this array."""
+        """Return the prominence below which a peak is noise, as `FrontEnd` computes it for this array."""
         rate, nfft = self.sample_rate_hz, self.settings.nfft
         hz = bin_frequencies_hz(band_bins(self.settings.srp_band_hz, rate, nfft), rate, nfft)
         beams = [Steering.towards(self.array, hz, self.spectra.azimuths_rad)]

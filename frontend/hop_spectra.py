@@ -1,7 +1,7 @@
-"""Cut a stream into hops that do not drift, and turn a hop into the sums that windows are made of.
+"""Hops of a stream without drift, and the sums per hop that make up windows.
 
-Beside them stand the hop's band levels, of a few microphones, and the noise that its place does not have
-usually.
+This file also has the band levels of a hop, averaged over some microphones, and the detection of noise that
+is unusual for the place.
 """
 
 import math
@@ -42,7 +42,7 @@ from .settings import ELEVATIONS_RAD, HIGHEST_SHARE, HOP_RATE_HZ, LOOMING_BAND_H
 
 
 def hop_end(index: int, sample_rate_hz: float) -> int:
-    """Sample at which hop k, `index`, ends: ``n_k = floor(k fs / r + 1/2)`` with r = 10 hops a second.
+    """Return the end sample of hop k, `index`: ``n_k = floor(k fs / r + 1/2)`` with r = 10 hops per second.
 
     Examples
     --------
@@ -62,7 +62,7 @@ class Hop:
 
 
 class HopCutter:
-    """Collect blocks of any length and return whole hops, in time proportional to the samples."""
+    """Collects blocks of any length and returns whole hops; time is proportional to the number of samples."""
 
     def __init__(self, n_channels: int, sample_rate_hz: float) -> None:
         self._rate_hz = sample_rate_hz
@@ -72,7 +72,7 @@ class HopCutter:
         self._buffer = np.empty((math.ceil(sample_rate_hz / HOP_RATE_HZ) + 1, n_channels), np.float32)
 
     def cut(self, block: Float32Array) -> Iterator[Hop]:
-        """Take a block (n, M) and yield the hops that it completes; the iterator must be read to its end."""
+        """Process a block (n, M) and yield the hops that it completes; read the iterator to its end."""
         while len(block):
             length = self._end - self._start
             missing = length - self._filled
@@ -93,24 +93,24 @@ class HopCutter:
 class HopSums:
     """Sums over the STFT frames that end within one hop."""
 
-    heard: BoolArray  # shape (frames,): Frames without lost samples, of which the sums are
-    lost: float  # Share of the samples of the hop that are lost
-    share: float  # Share of the hop that lost samples and noise leave to be heard
-    unheard: str | None  # What takes the rest
+    heard: BoolArray  # shape (frames,): Frames without lost samples, which the sums include
+    lost: float  # Share of lost samples in the hop
+    share: float  # Usable share of the hop, without lost samples and noise
+    unheard: str | None  # Reason why the rest is not usable
     centre: float  # Mean of the middles of these frames, samples from the start of the stream
-    # shape (elevations * azimuths,): Steered power. Where microphones are left out, power and pairs are
-    # scaled to the value for all of them.
+    # shape (elevations * azimuths,): Steered power. If microphones are excluded, power and pairs are rescaled
+    # to the value for all microphones.
     power: FloatArray
     pairs: Complex128Array  # shape (30,): Pair sums of the published feature
-    energies: FloatArray  # shape (M,): Mean square in the looming band of every microphone
+    energies: FloatArray  # shape (M,): Mean square in the looming band at every microphone
     health: ArrayHealth  # Faults of the array, and the microphones used
-    n_frames: int  # Number of frames that the sums are of
-    # Share that coherence and positions leave to be heard, and what takes the rest.
+    n_frames: int  # Number of frames in the sums
+    # Usable share according to coherence and positions, and the reason why the rest is not usable.
     common: tuple[float, str | None] = (1.0, None)
 
 
 def hop_window(n_hops: int, n_directions: int, n_channels: int) -> Any:
-    """Return the sums of the hops of a window, a row a hop, the oldest first: all zero before the first."""
+    """Return an empty window: the sums of its hops, one row per hop, oldest first, all zero."""
     numbers = [(name, float) for name in ("n_frames", "n_new", "share", "lost", "centre")]
     pairs = ("pairs", complex, len(FEATURE_AZIMUTHS_RAD))
     sums = [("power", float, n_directions), pairs, ("energies", float, n_channels)]
@@ -118,7 +118,7 @@ def hop_window(n_hops: int, n_directions: int, n_channels: int) -> Any:
 
 
 def push_hop(window: Any, hop: HopSums, share: float, unheard: str | None) -> None:
-    """Put the newest hop into a window: noise leaves it a share to be heard; below 0.2 its sums are empty."""
+    """Add the latest hop to a window, with its usable share after noise; below 0.2 its sums are empty."""
     least = min(share, hop.share)
     heard = least == hop.share or least >= LEAST_HEARD
     window[:-1] = window[1:]
@@ -128,7 +128,7 @@ def push_hop(window: Any, hop: HopSums, share: float, unheard: str | None) -> No
 
 
 class HopSpectra:
-    """Transform, whiten and steer one hop; only the transform and the optional stages have a memory."""
+    """Transforms, whitens and steers one hop; only the transform and the optional stages have a memory."""
 
     def __init__(self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings) -> None:
         nfft = settings.nfft
@@ -139,7 +139,7 @@ class HopSpectra:
         inside = (slice(b.start - bins.start, b.stop - bins.start) for b in bands)
         self._srp, self._feature, self._looming = inside
         frequencies = bin_frequencies_hz(self.srp_bins, sample_rate_hz, nfft)
-        # A row of elevation each: the few dimensions and nodes that do for one are too many for all together.
+        # One steering per elevation, because the rank and the number of nodes for all together are too large.
         azimuths = settings.azimuths_rad()
         rows = (Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD)
         self.beams = tuple(rows)
@@ -154,8 +154,8 @@ class HopSpectra:
         self._common = CommonSound(array, heard_hz) if settings.watch_channels else None
 
     def push(self, samples: Float32Array, recorded: Float32Array) -> HopSums:
-        """Return the sums over the frames that these samples (n, M) complete, lost ones left out."""
-        # Faults are looked for in what was recorded: resampled, a clipped sound has no highest value.
+        """Return the sums over the frames that these samples (n, M) complete, without lost frames."""
+        # Faults are detected in the recorded samples, because resampled clipping has no constant maximum.
         lost = np.zeros(len(recorded), bool) if self.monitor is None else self.monitor.find_lost(recorded)
         lost = lost[np.arange(len(samples)) * len(recorded) // len(samples)]
         spectra = self._stft.push(samples)
@@ -164,7 +164,7 @@ class HopSpectra:
         centre, spectra = self._centre(heard), spectra if n_heard == len(heard) else spectra[heard]
         powers = power(spectra)
         whitened = whiten(spectra, powers)
-        # Mean square in the looming band per frame and microphone: see `bands.mean_square_per_bin`.
+        # Mean square in the looming band per frame and microphone: see `mean_square_per_bin`.
         energies = powers[:, self._looming].sum(axis=1, dtype=np.float64) * (2.0 / (0.375 * self._nfft**2))
         matrices = cross_spectra(whitened[:, self._feature].transpose(1, 0, 2))
         health = self._unmonitored
@@ -184,15 +184,15 @@ class HopSpectra:
         return HopSums(heard, share, 1.0 - share, reason, centre, *sums, health, n_heard, common)
 
     def _heard_frames(self, lost: BoolArray, n_new: int) -> BoolArray:
-        """Return which new frames hold no lost sample; lost has shape (n,)."""
-        # From the first sample of the first new frame on; neighbouring frames share a half.
+        """Return which new frames contain no lost sample; lost has shape (n,)."""
+        # The flags start at the first sample of the first new frame; neighbouring frames share a half.
         flags, half = np.concatenate([self._lost_tail, lost]), self._nfft // 2
         self._lost_tail = flags[n_new * half :]
         halves = np.asarray(flags[: (n_new + 1) * half].reshape(-1, half).any(axis=1))
         return np.asarray(~(halves[1:] | halves[:-1]))
 
     def _centre(self, heard: BoolArray) -> float:
-        """Middle of the new frames that are heard, of all if none is; frame t covers t N/2 .. t N/2 + N."""
+        """Return the centre of the usable new frames, or of all if none; frame t is t N/2 .. t N/2 + N."""
         first, self._n_frames = self._n_frames, self._n_frames + len(heard)
         numbers = heard.nonzero()[0] if True in heard else np.arange(len(heard))
         return 0.5 * self._nfft * (float(mean(numbers)) + first + 1.0)
@@ -203,7 +203,7 @@ SILENCE = 1e-20
 
 
 def looming_of(times_s: FloatArray, energies: FloatArray, floor: EnergyFloor) -> Looming | NotUsable:
-    """Return the approach rate at time 0 by the energies of hops, (n,), in the noise of half a minute."""
+    """Return the approach rate at time 0 from the energies of hops, (n,), and the noise floor."""
     lowest = min(energies.tolist(), default=0.0)
     if len(times_s) < MIN_POINTS or lowest <= SILENCE:
         return NotUsable("silence within the window")
@@ -213,11 +213,11 @@ def looming_of(times_s: FloatArray, energies: FloatArray, floor: EnergyFloor) ->
 
 
 def band_edges(bins: range, n_bands: int) -> IntArray:
-    r"""Edges of bands that grow by an equal ratio, at least one bin wide each.
+    r"""Return the edges of bands whose widths grow by an equal ratio, each at least one bin wide.
 
     .. math:: e_{b+1} = \max\big(e_b + 1,\; \mathrm{round}(e_b\, (e_B / e_b)^{1 / (B - b)})\big)
 
-    with e_0 the first bin and e_B the end.
+    where e_0 is the first bin and e_B the end.
     """
     if not 1 <= n_bands <= len(bins) or bins.start < 1:
         raise InvalidArgumentError(f"n_bands: expected 1 to {len(bins)} bands within {bins}, got {n_bands}")
@@ -229,7 +229,7 @@ def band_edges(bins: range, n_bands: int) -> IntArray:
 
 
 def mean_square_per_bin(powers: Float32Array, nfft: int) -> FloatArray:
-    r"""Mean square of the sound per bin, averaged over frames and channels.
+    r"""Return the mean square of the sound per bin, averaged over frames and channels.
 
     .. math:: \overline{x^2}[k] = \frac{2 \langle |X[k]|^2 \rangle}{N \sum_n w[n]^2},
               \qquad \sum_n w^2 = 3 N / 8
@@ -246,7 +246,7 @@ def mean_square_per_bin(powers: Float32Array, nfft: int) -> FloatArray:
 
 
 def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> FloatArray:
-    r"""Natural logarithm of the mean square in each band; silence is floored at 1e-20.
+    r"""Return the natural logarithm of the mean square in each band, at least that of 1e-20.
 
     .. math:: L_b = \ln \max\Big(\sum_{k = e_b}^{e_{b+1} - 1} \overline{x^2}[k],\; 10^{-20}\Big)
 
@@ -261,12 +261,12 @@ def log_band_energy(mean_square: FloatArray, edges: IntArray, first: int) -> Flo
 
 
 BANDS = 16
-# Microphones, evenly picked, that are averaged.
+# Number of microphones, evenly spaced, that are averaged.
 _MOST_CHANNELS = 8
 
 
 class LevelMeter:
-    """Log-energy per band and hop, averaged over a few microphones: the level is the same at all of them."""
+    """Log-energy per band and hop, averaged over some microphones, because the level is similar at all."""
 
     def __init__(
         self, n_channels: int, sample_rate_hz: float, settings: FrontEndSettings, recorded_hz: float = np.inf
@@ -276,7 +276,7 @@ class LevelMeter:
         bins = band_bins((low, min(high, highest)), sample_rate_hz, settings.nfft)
         self._bins = range(max(bins.start, 1), bins.stop)
         self._edges = band_edges(self._bins, BANDS)
-        # A bin reaches half its width to either side of its frequency.
+        # A bin extends by half its width to both sides of its frequency.
         self.edges_hz: FloatArray = (self._edges - 0.5) * sample_rate_hz / settings.nfft
         self._nfft = settings.nfft
         step = -(-n_channels // _MOST_CHANNELS)
@@ -286,13 +286,14 @@ class LevelMeter:
     def push(
         self, samples: Float32Array, keep: BoolArray | None = None, heard: BoolArray | None = None
     ) -> FloatArray:
-        r"""Return the log-energy (bands,) of the heard frames among those that these samples (n, M) complete.
+        r"""Return the log-energy (bands,) of the usable frames that these samples (n, M) complete.
 
         .. math:: L_b = \ln \sum_{k \in b} \overline{x^2}[k]
 
-        All are heard unless `heard` (frames,) says otherwise; where none is, it is that of silence.
+        All frames are usable by default; without usable frames the result is that of silence.
         """
-        # Only the picked microphones that are kept (M,) are averaged, or all picked ones if none is.
+        # The average is over the selected microphones that are kept (M,), or over all selected ones if none
+        # is.
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
         if heard is not None and False in heard:
             powers = powers[heard]
@@ -303,41 +304,42 @@ class LevelMeter:
 
 
 _DB = 10.0 / float(np.log(10.0))
-# A minute, looked through once a second. The quiet street is what a fifth of it stays below: vehicles that
-# pass are seldom there for longer.
+# One minute, evaluated once per second. The quiet level is its 20 % quantile, because passing vehicles are
+# rarely present for a larger share of the time.
 _MINUTE_HOPS, _EVERY_HOPS, _QUIET_SHARE = 600, 10, 0.2
-# Twenty simulated demos: the incoherent share of hops with a vehicle is at most .3, of white noise between
-# the microphones 10 dB above the street .35 and more, 25 dB above it .9.
+# In twenty simulated demos, the incoherent share is at most 0.3 in hops with a vehicle. For white noise that
+# is independent between the microphones it is 0.35 or more at 10 dB above the street, and 0.9 at 25 dB.
 _INCOHERENT = 0.5
-# Decibels above the quiet street: of vehicles that are hidden 1 to 8 s before they come into view 1 to 10.
-# Below the first, incoherent noise hides none of them, above the second all.
+# Decibels above the quiet level. Vehicles that are hidden 1 to 8 s before they come into view have 1 to 10.
+# Incoherent noise below the first value masks none of them, and above the second value all.
 _NOISE_DB = (6.0, 12.0)
-# Rise above the loudest of the last three hops. Vehicles, van and edge included, rise by less than 3 dB; in
-# five minutes of busy simulated streets no hop is masked. Of 394 real clips one of 29 idling engines is, no
-# siren of 32, and 27 of 29 shots.
+# Rise above the loudest of the last three hops. Vehicles, including a van at an edge, rise by less than 3 dB,
+# and no hop is masked in five minutes of busy simulated streets. Of 394 real clips, one of 29 idling engines
+# is masked, no siren of 32, and 27 of 29 shots.
 _JUMP_DB, _JUMP_HOPS = (6.0, 10.0), 3
-# Fall below the loudest hop of a noise by which it ends; what lasts ten seconds is the place's own.
+# A masking noise ends when it falls by this much below its loudest hop; after ten seconds it is usual for the
+# place.
 _END_DB, _LONGEST_HOPS = 5.0, 100
-# Excess of the lowest quarter of the bands over the highest that only wind has.
+# Excess of the lowest over the highest quarter of the bands that only wind causes.
 _WIND_DB = 10.0
 
 
 class NoiseMeter:
-    r"""Share of a hop that noise leaves to be heard: noise that this place does not usually have.
+    r"""Usable share of a hop in the presence of noise that is unusual for the place.
 
     .. math:: e = \Big\langle L_b - q_{20\%}(L_b) \Big\rangle_b, \qquad
               f = 1 - \frac{C}{\mathrm{median}\, C}
 
-    with the level L of a band b, its quantile over the last minute, and the coherence C of the sound over the
-    array, the mean of the feature. Noise between the microphones (wind, rain) is far above the quiet street
-    (6 to 12 dB) and mostly incoherent (f > 1/2). Noise that is the same in all of them begins with a rise by
-    6 to 10 dB within .3 s, and lasts until it falls by 5 dB or the street has become as loud, at most ten
-    seconds.
+    L is the level of a band b, with its quantile over the last minute, and C the coherence of the sound over
+    the array, the mean of the feature. Noise that is independent between the microphones (wind, rain) is far
+    above the quiet level (6 to 12 dB) and mostly incoherent (f > 1/2). Noise that is common to them begins
+    with a rise by 6 to 10 dB within 0.3 s. It ends when it falls by 5 dB or the street has become as loud,
+    after at most ten seconds.
 
     Attributes
     ----------
     excess_db : float
-        e of the newest hop, decibels.
+        e of the latest hop, decibels.
     """
 
     def __init__(self, mask_rises: bool = True) -> None:
@@ -347,20 +349,21 @@ class NoiseMeter:
         self._quiet: FloatArray = np.zeros(BANDS)
         self._usual_coherence = 0.0
         self._recent: deque[float] = deque(maxlen=_JUMP_HOPS)
-        # Level before a jump, the highest since, and the hop in which it began; None without one.
+        # Level before a jump, highest level since then, and hop of its begin; None without a jump.
         self._jump: tuple[float, float, int] | None = None
 
     def skip(self) -> None:
-        """Pass a hop that was lost: what comes after it may be louder than what was before."""
+        """Skip a lost hop; the sound after it may be louder than before."""
         self._recent.clear()
         self._jump = None
 
     def push(
         self, levels: FloatArray, coherence: float, common: tuple[float, str | None] = (1.0, None)
     ) -> tuple[float, str | None]:
-        """Take log-energies (bands,) and the coherence of a hop; return its share and what takes the rest.
+        """Return the usable share of a hop from its log-energies (bands,) and coherence, and a reason.
 
-        `common` is the same before levels are compared: what is then not heard is not the place's own.
+        `common` is the usable share without the comparison of levels; a hop that is unusable in this way does
+        not change the usual level.
         """
         heard = common[0] >= LEAST_HEARD
         if not heard and not self._memory:
@@ -369,7 +372,7 @@ class NoiseMeter:
         return masked if masked[0] <= common[0] else common
 
     def _masked(self, level_db: FloatArray, coherence: float, learn: bool) -> tuple[float, str | None]:
-        """Return the share that noise above this place's usual leaves; learn what is usual if it is heard."""
+        """Return the usable share after unusual noise; update the usual level if `learn` is true."""
         if learn:
             self._memory.append(np.concatenate([level_db, [coherence]]))
         if self._n_hops < _EVERY_HOPS or self._n_hops % _EVERY_HOPS == 0:
@@ -390,7 +393,7 @@ class NoiseMeter:
         return min(shares), "wind" if is_wind else "noise far above this place's usual"
 
     def _rise_db(self, loudness_db: float) -> float:
-        """Return how far the level is above that before a jump, 0 without one."""
+        """Return the level relative to that before a jump, 0 without a jump."""
         before = max(self._recent, default=loudness_db)
         self._recent.append(loudness_db)
         if self._jump is None and loudness_db - before > _JUMP_DB[0]:
@@ -399,7 +402,7 @@ class NoiseMeter:
             return 0.0
         before, highest, begin = self._jump
         highest = max(highest, loudness_db)
-        # The hop in which it ends still holds some of it.
+        # The hop in which the noise ends still contains a part of it.
         has_ended = loudness_db < highest - _END_DB or self.excess_db < _JUMP_DB[0]
         is_old = self._n_hops - begin >= _LONGEST_HOPS
         self._jump = None if has_ended or is_old else (before, highest, begin)

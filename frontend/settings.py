@@ -13,16 +13,17 @@ from worldstate.ground import FloatArray, InvalidArgumentError, in_range
 
 Band = tuple[float, float]
 
-# A decision every tenth of a second, on the latest second; the feature has two halves.
+# A decision every tenth of a second on the latest second; the feature has two halves.
 HOP_RATE_HZ, WINDOW_HOPS = 10.0, 10
-# Hops in the bearing. More suppress noise, but the azimuth of a passing car changes by tens of degrees per
-# second, and the bearing is that of the middle of the interval.
+# Hops for the bearing. More hops suppress noise, but the azimuth of a passing car changes by tens of degrees
+# per second, and the bearing refers to the middle of the interval.
 BEARING_HOPS = 2
-# The horizon, and the street from 5 to 20 m ahead of a roof: tyres 8 m away are 10 degrees below it. Searched
-# at the horizon alone, an array with rows at several heights takes the detour for another azimuth: simulated
-# vehicles in view are 5 degrees off in the median with 56 microphones and 50 with 4, with both rows 3 and 1.
+# The horizon, and the street from 5 to 20 m ahead of a roof: tyres at 8 m are 10 degrees below the horizon.
+# With a search at the horizon only, an array with rows at several heights interprets the path difference as
+# another azimuth: the median error for simulated visible vehicles is 5 degrees with 56 microphones and 50
+# with 4; with both elevations it is 3 and 1 degrees.
 ELEVATIONS_RAD = np.radians([-12.0, 0.0])
-# The paper's band, for microphones 8.8 cm apart.
+# Band of the paper, for microphones 8.8 cm apart.
 BAND_HZ = (300.0, 1800.0)
 LOOMING_BAND_HZ = BAND_HZ
 
@@ -36,21 +37,21 @@ class FrontEndSettings:
     nfft : int
         Frame length, samples, even; frames overlap by half.
     azimuth_span_deg : (float, float)
-        First and last azimuth searched, a whole number of degrees apart, left positive.
+        First and last azimuth of the search, a whole number of degrees apart, left positive.
     tone_band_hz : (float, float), optional
-        Band in which an engine line is searched, Hz, for example (20, 400); None switches it off.
+        Band of the search for an engine line, Hz, for example (20, 400); None switches it off.
     srp_band_hz, level_band_hz : (float, float)
-        Bands, Hz; the upper end of `level_band_hz` is cut at 0.45 of the sample rate.
+        Bands, Hz; the upper end of `level_band_hz` is limited to 0.45 of the sample rate.
     watch_channels : bool
-        Detect faulty microphones, lost samples and masking noise, and leave them out.
+        Detect faulty microphones, lost samples and masking noise, and exclude them.
     mask_rises : bool
-        Leave out sound that rises by 6 to 10 dB within 0.3 s, which covers others, until it falls again.
+        Exclude sound that rises by 6 to 10 dB within 0.3 s, because it masks other sound, until it falls.
     character : bool
-        Measure what one microphone hears over two seconds: `AcousticFrame.character`.
+        Measure the character of the sound at one microphone over two seconds: `AcousticFrame.character`.
     feature_order : tuple of int, optional
-        Channels in the order in which the feature forms its pairs, where it is not that of the array.
+        Order of the channels in the pairs of the feature, if it is not that of the array.
     heard_rate_hz : float, optional
-        Rate that the sound is brought to before anything but faults of microphones is read; its own if None.
+        Rate to which the sound is resampled before everything but the check of microphones; None keeps it.
 
     Raises
     ------
@@ -90,7 +91,7 @@ class FrontEndSettings:
 
     @classmethod
     def heard_at(cls, sample_rate_hz: float, **others: Any) -> Self:
-        """Return settings for sound of any rate, with frames as the published feature has them.
+        """Return settings for sound of any rate, with frames that suit the published feature.
 
         Examples
         --------
@@ -103,7 +104,7 @@ class FrontEndSettings:
         return cls(published.feature_nfft(rate), heard_rate_hz=heard, **others)
 
     def azimuths_rad(self) -> FloatArray:
-        """Return the grid of azimuths, one a degree, ascending from right to left.
+        """Return the grid of azimuths in steps of one degree, ascending from right to left.
 
         Returns
         -------
@@ -119,24 +120,24 @@ class FrontEndSettings:
         return np.radians(np.linspace(first, last, round(last - first) + 1))
 
 
-# Highest frequency that the anti-aliasing filters of usual converters pass, relative to the sample rate.
+# Highest frequency in the pass band of usual anti-aliasing filters, relative to the sample rate.
 HIGHEST_SHARE = 0.45
-# No lower than the paper's band for microphones farther apart: over a band of two octaves the aliases of the
-# spatial spectrum fall on other directions at each frequency, and low bands are blunt. White sources at 0 dB,
-# a pair 1 m apart: median error .9 deg in 150-900 Hz, .2 deg in 300-1800 Hz.
+# For microphones farther apart, the band is not lower than the paper's: over two octaves, the aliases of the
+# spatial spectrum have different directions at each frequency, and low bands have a low resolution. For white
+# sources at 0 dB and a pair 1 m apart, the median error is 0.9 deg in 150-900 Hz and 0.2 deg in 300-1800 Hz.
 _MOST_OCTAVES = 2
 _FRAME_S = published.FEATURE_NFFT / published.FEATURE_RATE_HZ
 
 
 def default_band_hz(array: MicrophoneArray, sample_rate_hz: float) -> tuple[float, float]:
-    r"""Return the paper's band, moved by whole octaves to the highest that the spacing samples.
+    r"""Return the paper's band, moved up by whole octaves as far as the spacing permits.
 
     .. math:: (300, 1800)\,\mathrm{Hz} \cdot 2^n, \qquad
               n = \Big\lfloor \log_2 \frac{f_{alias}}{1800\,\mathrm{Hz}} \Big\rfloor \in [0, 2]
 
     Shapes: returns (2,).
     """
-    # Whole octaves, so that arrays of about the paper's spacing keep the paper's band exactly.
+    # Whole octaves, so that arrays with approximately the paper's spacing have exactly the paper's band.
     low, high = BAND_HZ
     spacing = min(max(math.floor(math.log2(array.alias_hz() / high)), 0), _MOST_OCTAVES)
     octaves = min(spacing, math.floor(math.log2(HIGHEST_SHARE * sample_rate_hz / high)))
@@ -144,14 +145,15 @@ def default_band_hz(array: MicrophoneArray, sample_rate_hz: float) -> tuple[floa
 
 
 def default_span_deg(array: MicrophoneArray, sample_rate_hz: float) -> float:
-    r"""Return the sector ahead that an array hears without a mirror image: 360 degrees, or 180.
+    r"""Return the sector ahead that an array resolves without a mirror image: 360 degrees, or 180.
 
-    Microphones lie off a vertical plane if their deviation from the nearest one turns a wave of the highest
-    frequency of the band by a radian between a direction and its mirror image:
+    Microphones are not in one vertical plane if, at the highest frequency of the band, their deviations from
+    the nearest such plane change the phase of a wave by a radian between a direction and its mirror image:
 
     .. math:: \frac{4 \pi f}{c} \sqrt{\frac1M \sum_m d_m^2} \ge 1
 
-    A wave that takes longer through the array than an STFT frame lasts is not coherent in it.
+    The sector is 180 degrees if a wave takes longer through the array than an STFT frame, because it is then
+    not coherent within the frame.
 
     Examples
     --------

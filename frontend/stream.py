@@ -1,4 +1,4 @@
-"""The streaming acoustic front-end: samples in, one `AcousticFrame` per hop out."""
+"""The streaming acoustic front-end, which returns one `AcousticFrame` per hop of samples."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -46,14 +46,14 @@ class AcousticFrame:
 
     .. math:: \hat\theta = \arg\max_\theta P(\theta), \qquad \rho = P(\hat\theta) / \mathrm{median}_\theta P
 
-    with the bearing, its prominence rho, and the SRP-PHAT spectrum P of the last two hops.
+    where the bearing and its prominence rho come from the SRP-PHAT spectrum P of the last two hops.
 
     Parameters
     ----------
     stamp_ns : int
-        End of the window, nanoseconds on the stream's clock.
+        Time at the end of the window, nanoseconds on the stream's clock.
     sample_index : int
-        Number of samples up to there.
+        Number of samples up to this time.
     azimuths_rad : ndarray, shape (A,)
         Grid of `srp`, radians, ascending from right (negative) to left.
     srp : ndarray of float64, shape (A,)
@@ -61,39 +61,39 @@ class AcousticFrame:
     bearing_rad, bearing_std_rad : float
         Azimuth of the highest peak over the last two hops and its standard deviation, radians.
     prominence : float
-        Peak-to-median ratio of the spectrum that the bearing was read from.
+        Peak-to-median ratio of the bearing's spectrum.
     least_prominence : float
-        Ratio that noise reaches with this array; a peak not above it says nothing of any direction.
+        Ratio that noise reaches with this array; a lower peak gives no direction.
     peaks : tuple of Peak
-        All peaks of that spectrum, highest first, at most four; the first is the bearing.
+        Peaks of the bearing's spectrum, highest first, at most four; the first is the bearing.
     band_log_energy : ndarray of float64, shape (16,)
-        Natural logarithm of the mean square of the last hop per band; of the last one that could be heard.
+        Natural logarithm of the mean square per band in the last usable hop.
     looming : Looming or NotUsable
         Approach rate at the end of the window.
     feature : ndarray of float64, shape (60,)
         The published feature of the decision window: two halves x thirty azimuths, from left to right.
     bearing_age_s : float
-        From the middle of the interval of the bearing to `stamp_ns`, seconds.
+        Time from the middle of the bearing's interval to `stamp_ns`, seconds.
     health : ArrayHealth or NotUsable
-        Faults of the microphones and which were left out.
+        Faults of the microphones, and which are excluded.
     tone : ToneReading or NotUsable
-        Engine line over the decision window; not usable when it is off or no tone exceeds the noise.
+        Engine line over the decision window; not usable if it is off or no tone exceeds the noise.
     character : ndarray, shape (49,), or NotUsable
-        What the middle microphone heard in the last two seconds, whatever its level: modulation, what bands
-        have in common, tones, harmonics, which a `DomainGuard` reads; and how the level is shared between
-        twelve bands, which a `RoadUserModel` reads, too.
+        Sound of the middle microphone in the last two seconds, independent of its level: modulation, its part
+        that is common to the bands, tones and harmonics (inputs of a `DomainGuard`); also the distribution of
+        the level over twelve bands (a further input of a `RoadUserModel`).
     lost : float
-        Share of the samples of the decision window that are lost: constant or repeated in all channels. STFT
-        frames that hold lost samples are left out of everything here; means are over the others.
+        Share of lost samples in the decision window: constant or repeated in all channels. STFT frames with
+        lost samples are excluded from all results; means are over the other frames.
     heard : float or None
-        Share that could be heard, of the newest hop or of the window, whichever is less; 0 where less than .4
-        of the window is left. Hops of which less than .2 could be heard are left out of everything here.
-        None where it is not measured: of given spectra.
+        Usable share of the latest hop or of the window, whichever is smaller; 0 if less than 0.4 of the
+        window is usable. Hops with a usable share below 0.2 are excluded from all results. None for given
+        spectra, for which it is not measured.
     unheard : str or None
-        Why the rest could not: "lost samples", "wind", "noise far above this place's usual", "no sound
-        common to the microphones" or "sound that contradicts the positions of the microphones".
+        Reason why the rest is not usable: "lost samples", "wind", "noise far above this place's usual", "no
+        sound common to the microphones" or "sound that contradicts the positions of the microphones".
     excess_db : float
-        Level of the newest hop above the quiet street, a mean over bands, decibels.
+        Level of the latest hop above the quiet street, averaged over bands, decibels.
 
     Examples
     --------
@@ -130,52 +130,53 @@ class AcousticFrame:
 
     @property
     def at_edge(self) -> bool:
-        """Whether the highest peak is at an end of the sector that was searched: its source may be beyond."""
+        """Whether the highest peak is at an end of the search sector, so that its source may be outside."""
         within = self.azimuths_rad[0] < self.bearing_rad < self.azimuths_rad[-1]
         return not (within or is_all_round(self.azimuths_rad))
 
 
 __all__ = ["AcousticFrame", "FrontEnd"]
 
-# Far above full scale of any converter; the power of an STFT frame still fits single precision.
+# Far above full scale of any converter; the power of an STFT frame is still within single precision.
 _LOUDEST = 1e15
-# Share of a window: with .6 s lost the feature and the evidence of a side are off by as much as they change
-# in half a second (medians .08 of .10 and .29 of .30 nats, twelve simulated demos), with .7 s by .39 nats.
+# Usable share of a window. With 0.6 s lost, the feature and the evidence of a side change by as much as
+# within half a second (medians 0.08 of 0.10 and 0.29 of 0.30 nats, twelve simulated demos); with 0.7 s lost
+# by 0.39 nats.
 _LEAST_OF_WINDOW = 0.4 - 1e-9
-# Of a tenth of a second the feature is off: fourteen demos after a lost second, probability that a vehicle
-# comes .349 with it, .361 with the whole window in its place, .43 without the loss.
+# A tenth of a second is too short for the feature. In fourteen demos after a lost second, the probability of
+# an approaching vehicle is 0.349 with it, 0.361 if the whole window replaces it, and 0.43 without the loss.
 _LEAST_OF_HALF = 0.3
-# The energy of less than half a hop scatters too much for a point of the looming fit.
+# The energy of less than half a hop varies too much for a point of the looming fit.
 _LEAST_OF_HOP = 0.5
 
 
 def _full_scale(dtype: np.dtype[Any]) -> np.float32:
-    """Return what brings whole numbers of a converter to full scale 1."""
+    """Return the factor that scales integer samples of a converter to full scale 1."""
     if dtype not in (np.int16, np.int32):
         raise InvalidArgumentError(f"block: expected floats of full scale 1, int16 or int32, got {dtype}")
     return np.float32(1.0 / -float(np.iinfo(dtype).min))
 
 
 class FrontEnd:
-    r"""Bearing, approach rate and signature of the sound around an array, once per hop (0.1 s).
+    r"""Bearing, approach rate and signature of the sound at an array, once per hop (0.1 s).
 
     .. math:: P(\theta) = \frac{1}{T K M^2} \sum_{t,k} \Big| \sum_m \overline{a_{k,m}(\theta)}\,
               \frac{X_{t,k,m}}{|X_{t,k,m}|} \Big|^2, \qquad \hat\theta = \arg\max_\theta P(\theta)
 
     The SRP spectrum over the T STFT frames of the window is one of the results; `AcousticFrame` lists all. An
-    STFT frame belongs to the hop in whose samples it ends. Hop k ends at sample floor(k fs / 10 + 1/2),
-    without drift; the first result is at the end of the first full window. Sums are kept per hop, so that a
-    window of one second costs only its newest hop, and hops are cut before any computation, so that the
-    result does not depend on the length of the blocks. Memory does not grow.
+    STFT frame belongs to the hop in which it ends. Hop k ends at sample floor(k fs / 10 + 1/2), without
+    drift. The first result is available after the first full window. Sums are stored per hop, so a window of
+    one second needs only the computation of its latest hop. The stream is cut into hops first, so results do
+    not depend on the length of the blocks. Memory is bounded.
 
     Parameters
     ----------
     array : MicrophoneArray
-        One microphone a channel, in the order of the channels. A planar array across the vehicle shows
-        sources behind it mirrored to the front: see `MicrophoneArray.ambiguity`.
+        One microphone per channel, in the order of the channels. With a planar array across the vehicle,
+        sources behind it appear in front: see `MicrophoneArray.ambiguity`.
     sample_rate_hz : float
-        Samples per second, also of those that `sample_index` counts; more than twice the highest frequency
-        of the bands. `FrontEndSettings.heard_at` gives settings for sound of any rate.
+        Samples per second, the unit of `sample_index`; more than twice the highest frequency of the bands.
+        `FrontEndSettings.heard_at` returns settings for any rate.
     settings : FrontEndSettings, optional
         Bands, windows, grids and stages; the values of the paper by default, with frames of `feature_nfft`.
     start_ns : int
@@ -215,11 +216,11 @@ class FrontEnd:
         wanted_hz, n_channels = settings.heard_rate_hz, array.n_microphones
         self._resampler = Resampler(n_channels, self.sample_rate_hz, wanted_hz) if wanted_hz else None
         self.heard_rate_hz = rate = self._resampler.rate_hz if self._resampler else self.sample_rate_hz
-        band_bins(settings.srp_band_hz, self.sample_rate_hz, settings.nfft)  # refuses what was not recorded
+        band_bins(settings.srp_band_hz, self.sample_rate_hz, settings.nfft)  # Checks the original rate
         hop = rate / HOP_RATE_HZ
         if settings.nfft > hop:
             problem = f"expected at most one hop of {hop:.0f} samples, got {settings.nfft}"
-            advice = "sound of a higher rate (6 kHz will do), or shorter frames"
+            advice = "use a higher sample rate (at least 6 kHz) or shorter frames"
             raise InvalidArgumentError(f"nfft: {problem}: {advice}")
         self._start_ns = start_ns
         self._azimuths = settings.azimuths_rad()
@@ -242,27 +243,27 @@ class FrontEnd:
         n_directions = sum([row.weights.shape[2] for row in self._spectra.beams])
         self._window = hop_window(WINDOW_HOPS, n_directions, n_channels)
         self._health = ArrayHealth.unknown(n_channels)
-        self._nearest: tuple[bytes, int] = b"", 0  # Microphones kept, and the middle one of them
+        self._nearest: tuple[bytes, int] = b"", 0  # Kept microphones, and the middle one of them
 
     def process(self, block: ArrayLike) -> list[AcousticFrame]:
-        """Take the next samples; return one result for every hop that they complete after the first window.
+        """Process the next samples; return one result for every completed hop after the first window.
 
         Parameters
         ----------
         block : array_like, shape (n, M)
-            Samples, any n from one sample to a whole file: floats of full scale 1, or int16 and int32 as a
-            converter gives them, which are scaled to that.
+            Samples, from a single sample to a whole file: floats of full scale 1, or int16 and int32 samples
+            of a converter, which are scaled to it.
 
         Returns
         -------
         list of AcousticFrame
-            In order of time; empty if no hop is complete.
+            Results in temporal order; empty if no hop is complete.
 
         Raises
         ------
         InvalidArgumentError
-            On another number of channels, values that are no numbers, whole numbers of another width, NaN,
-            infinity or beyond 1e15; the state is unchanged.
+            On another number of channels, values that are not numbers, integers of another width, NaN,
+            infinity or magnitudes above 1e15; the state is then unchanged.
 
         Examples
         --------
@@ -279,16 +280,16 @@ class FrontEnd:
         return self._process_hops(samples)
 
     def finish(self) -> list[AcousticFrame]:
-        """Return the results of a hop that has ended and waits for later samples, 16 ms at most."""
+        """Return the results of hops that wait for later samples of the resampler, at most 16 ms."""
         return [] if self._resampler is None else self._process_hops(self._resampler.flush())
 
     def skip(self, lost_ns: int) -> None:
-        """Let time go on by sound that was lost and is not given as silence: all later stamps are later.
+        """Advance the time by lost sound that is not replaced by silence; all later stamps are later.
 
         Parameters
         ----------
         lost_ns : int
-            Length of the sound, nanoseconds.
+            Duration of the lost sound, nanoseconds.
 
         Raises
         ------
@@ -317,7 +318,7 @@ class FrontEnd:
         if isinstance(block, np.ndarray) and block.dtype.kind in "iu":
             samples = samples * _full_scale(block.dtype)
         check_shape("block", samples.shape, (None, self.array.n_microphones))
-        # Written so that NaN is refused: it is the least and the most, and every comparison with it is false.
+        # With NaN both extremes are NaN and every comparison is false, so it is rejected.
         lowest, highest = [one(samples, None, initial=0.0) for one in (np.minimum.reduce, np.maximum.reduce)]
         if lowest >= -_LOUDEST and highest <= _LOUDEST:
             return samples
@@ -345,14 +346,14 @@ class FrontEnd:
             return self._frame(hop, levels) if hop.index >= WINDOW_HOPS else None
 
     def _middle(self) -> int:
-        """Return the microphone nearest to the middle of those that are used in the newest hop."""
+        """Return the microphone nearest to the centre among those used in the latest hop."""
         kept = self._keep.tobytes()
         if kept != self._nearest[0]:
             self._nearest = kept, int(self.array.nearest(self._keep)[0])
         return self._nearest[1]
 
     def _unmasked(self, levels: FloatArray, newest: HopSums) -> FloatArray:
-        """Take the newest hop, empty if noise masks it; return its levels, or those of the last one heard."""
+        """Add the latest hop, empty if noise masks it; return its levels, or the last usable ones."""
         noise, share, reason = self._noise, newest.share, newest.unheard
         if noise is not None and newest.n_frames:
             coherence = float(mean(self._scaled(newest.pairs[None], newest.n_frames)))
@@ -390,28 +391,28 @@ class FrontEnd:
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
             lost=sum(hops["lost"].tolist()) / WINDOW_HOPS,
             heard=0.0 if window < _LEAST_OF_WINDOW else min(window, shares[-1]),
-            # The latest of the hops of which least was heard.
+            # The latest of the hops with the smallest usable share.
             unheard=hops["unheard"][WINDOW_HOPS - 1 - int(hops["share"][::-1].argmin())],
             excess_db=0.0 if self._noise is None else self._noise.excess_db,
         )
 
     def _heard(self, n_hops: int) -> IndexArray:
-        """Return the last hops of the window in which something was heard, the last ones of all if none."""
+        """Return the last usable hops of the window, or the last hops if none is usable."""
         heard = self._window["n_frames"].nonzero()[0]
         return (heard if len(heard) else np.arange(WINDOW_HOPS))[-n_hops:]
 
     @property
     def _keep(self) -> BoolArray:
-        """Microphones that are used in the newest hop."""
+        """Microphones that are used in the latest hop."""
         return self._health.mask.keep
 
     @property
     def _used(self) -> BoolArray | slice:
-        """Microphones whose energy counts: those kept, or all where none is."""
+        """Microphones whose energy is used: those kept, or all if none is kept."""
         return self._keep if True in self._keep else slice(None)
 
     def _srp(self, hops: IndexArray | slice) -> FloatArray:
-        """SRP-PHAT of hops, (A,): the maximum over elevations."""
+        """Return the SRP-PHAT of hops, (A,): the maximum over elevations."""
         some = self._window[hops]
         total, n_frames = np.add.reduce(some["power"]), sum(some["n_frames"].tolist())
         n_bins, n_microphones = len(self._spectra.srp_bins), self.array.n_microphones
@@ -428,7 +429,7 @@ class FrontEnd:
         return np.concatenate([self._segment(slice(i, i + half)) for i in range(0, WINDOW_HOPS, half)])
 
     def _segment(self, half: slice) -> FloatArray:
-        """Return the feature of half a window; of the whole one where little was heard in the half."""
+        """Return the feature of half a window, or of the whole window if the half is hardly usable."""
         window, n_hops = self._window, WINDOW_HOPS // FEATURE_SEGMENTS
         used = half if sum(window["share"][half].tolist()) >= _LEAST_OF_HALF * n_hops else slice(None)
         return self._scaled(window["pairs"][used], sum(window["n_frames"][used].tolist()))
@@ -440,7 +441,7 @@ class FrontEnd:
     def _looming(self, end: int) -> Looming | NotUsable:
         window = self._window
         hops = (window["n_frames"] >= _LEAST_OF_HOP * np.maximum(window["n_new"], 1)).nonzero()[0]
-        # The same microphones in the whole window: one that fails within it must not look like a step of
+        # The same microphones over the whole window, because a failure of one must not look like a change of
         # level.
         energies = mean(window["energies"][:, self._used], 1)[hops]
         return looming_of((window["centre"][hops] - end) / self.heard_rate_hz, energies, self._energy_floor)

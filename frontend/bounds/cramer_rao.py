@@ -1,4 +1,4 @@
-r"""Cramer-Rao bounds of what the front-end estimates: the least variance of any unbiased estimator.
+r"""Cramer-Rao bounds for the front-end's estimates: the least variance of any unbiased estimator.
 
 All follow from :math:`\mathrm{var} \ge J^{-1}` with J the Fisher information. Signal-to-noise ratios are
 power ratios, not decibels.
@@ -16,8 +16,7 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
 
     .. math:: \mathrm{var}(\hat\tau) \ge \Big[2T \int_0^\infty (2\pi f)^2 \frac{C(f)}{1 - C(f)}\,df\Big]^{-1}
 
-    Ego-noise, wind and reverberation enter as a loss of coherence. The integral is taken by the trapezoidal
-    rule.
+    Ego-noise, wind and reverberation reduce the coherence. The integral is computed by the trapezoidal rule.
 
     Parameters
     ----------
@@ -31,7 +30,7 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
     Returns
     -------
     float
-        Seconds squared; infinite without coherence.
+        Variance in seconds squared; infinite without coherence.
 
     Raises
     ------
@@ -40,8 +39,8 @@ def delay_crb_s2(frequencies_hz: ArrayLike, coherence: ArrayLike, duration_s: fl
 
     Notes
     -----
-    A bound for small errors: below a threshold SNR the peak jumps to another lobe and the variance is far
-    larger.
+    The bound holds for small errors. Below a threshold SNR, the estimate jumps to another lobe and the
+    variance is far larger.
 
     References
     ----------
@@ -83,8 +82,8 @@ def bearing_crb_rad2(
         \mathrm{var}(\hat\theta) \ge \Big[\frac{8\pi^2 N}{c^2}\, S(\theta) \sum_b
         f_b^2\,\mathrm{SNR}_b\Big]^{-1}, \qquad S(\theta) = \dot u_\theta^T S\, \dot u_\theta.
 
-    For an array in the y-z plane this is the paper's: :math:`S(\theta) = S_{xx} \cos^2\theta`. With S_xx =
-    3.027 m^2, 1 kHz and c = 343 m/s it gives 1.80 deg / sqrt(2 N SNR) at broadside.
+    For an array in the y-z plane this is eq. (4) of the paper, :math:`S(\theta) = S_{xx} \cos^2\theta`. With
+    S_xx = 3.027 m^2, 1 kHz and c = 343 m/s it gives 1.80 deg / sqrt(2 N SNR) at broadside.
 
     Parameters
     ----------
@@ -93,18 +92,19 @@ def bearing_crb_rad2(
     azimuth_rad : float
         Azimuth of the source, at the horizon, radians, left positive.
     frequencies_hz : float or array_like, shape (bins,)
-        Narrowband frequency, or several bins whose information adds, Hz.
+        Frequency of a narrow band, or of several bins whose information is added, Hz.
     snr : float or array_like, shape (bins,)
-        Per microphone and snapshot, power ratio, spatially white noise.
+        Power ratio per microphone and snapshot, for spatially white noise.
     snapshots : int
         Number N of independent snapshots per bin.
     random_signal : bool
-        True: the unconditional bound, for a Gaussian signal, larger by 1 + 1 / (M SNR). False: the paper's.
+        True: the unconditional bound for a Gaussian signal, larger by 1 + 1 / (M SNR). False: the paper's
+        bound.
 
     Returns
     -------
     float
-        Radians squared; infinite at endfire of a planar array.
+        Variance in radians squared; infinite at endfire of a planar array.
 
     Raises
     ------
@@ -134,7 +134,8 @@ def bearing_crb_rad2(
     if random_signal:
         ratio = ratio * (len(positions) * ratio / (1.0 + len(positions) * ratio))
     azimuth = in_range("azimuth_rad", azimuth_rad, -np.inf, np.inf)
-    # Derivatives of the direction by azimuth and by elevation, which is known: the first alone counts.
+    # Derivatives of the direction by azimuth and elevation. The elevation is known, so only the first is
+    # used.
     slopes = direction_vectors(azimuth + np.pi / 2), direction_vectors(azimuth, np.pi / 2)
     lever = (positions - positions.mean(axis=0)) @ np.stack(slopes, axis=1)
     weight = 8 * np.pi**2 * snapshots / SPEED_OF_SOUND_M_S**2 * np.sum(frequencies**2 * ratio)
@@ -142,11 +143,11 @@ def bearing_crb_rad2(
 
 
 def endfire_information(positions_m: ArrayLike, azimuths_rad: ArrayLike) -> FloatArray:
-    r"""Return the bearing information relative to the array's best direction.
+    r"""Return the bearing information relative to that in the array's best direction.
 
     .. math:: \frac{J(\theta)}{\max_\theta J(\theta)} = \frac{\dot u^T S \dot u}{\lambda_{max}(S_{xy})}
 
-    It is :math:`\cos^2\theta` for an array across the vehicle and vanishes at endfire; the information on
+    For an array across the vehicle it is :math:`\cos^2\theta` and vanishes at endfire. The information on
     existence and radial speed does not depend on the bearing.
 
     Shapes: positions_m (M, 3).
@@ -170,7 +171,7 @@ def broadside_rad(positions_m: ArrayLike) -> float:
 
 
 def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
-    r"""Return the bound on the variance of a tone's frequency, amplitude and phase unknown.
+    r"""Return the bound on the variance of a tone's frequency if amplitude and phase are unknown.
 
     .. math:: \mathrm{var}(\hat f) \ge \frac{12}{(2\pi)^2\,\eta\,N_s (N_s^2 - 1)\,T_s^2}
 
@@ -179,8 +180,8 @@ def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
     snr : float
         :math:`\eta`, a power ratio, > 0. A real tone :math:`A\cos` in white noise of variance
         :math:`\sigma^2` has :math:`\eta = A^2 / 2\sigma^2`. A complex one :math:`A e^{j\cdot}` has
-        :math:`\eta = A^2 / \sigma^2` with :math:`\sigma^2` the variance of the real and of the imaginary part
-        each (of Rife and Boorstyn), i.e. twice its power over that of the noise.
+        :math:`\eta = A^2 / \sigma^2`, with :math:`\sigma^2` the variance of the real and of the imaginary
+        part (as in Rife and Boorstyn), i.e. twice the ratio of its power to that of the noise.
     samples : int
         Number of samples N_s >= 2.
     sample_rate_hz : float
@@ -189,7 +190,7 @@ def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
     Returns
     -------
     float
-        Hz squared.
+        Variance in Hz squared.
 
     Raises
     ------
@@ -198,7 +199,7 @@ def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
 
     Notes
     -----
-    For a real tone it holds away from 0 and half the sample rate, by a few times 1 / (N_s T_s).
+    For a real tone it holds at a distance of a few times 1 / (N_s T_s) from 0 and half the sample rate.
 
     References
     ----------
@@ -217,7 +218,7 @@ def tone_crb_hz2(snr: float, samples: int, sample_rate_hz: float) -> float:
 
 
 def radial_speed_crb_m2_s2(frequency_variance_hz2: float, rest_frequency_hz: float) -> float:
-    r"""Return the variance of a radial speed read from a tone of known frequency at rest.
+    r"""Return the variance of a radial speed that is estimated from a tone with known rest frequency.
 
     .. math:: \mathrm{var}(\hat v_r) = (c / f_0)^2\, \mathrm{var}(\hat f)
 
@@ -231,7 +232,7 @@ def radial_speed_crb_m2_s2(frequency_variance_hz2: float, rest_frequency_hz: flo
     Returns
     -------
     float
-        (m/s) squared, to first order in v_r / c.
+        Variance in (m/s) squared, to first order in v_r / c.
 
     Raises
     ------
@@ -240,7 +241,7 @@ def radial_speed_crb_m2_s2(frequency_variance_hz2: float, rest_frequency_hz: flo
 
     Notes
     -----
-    In a street the stability of the tone itself, not this bound, limits the accuracy.
+    In a street, the stability of the tone limits the accuracy more than this bound does.
 
     References
     ----------
@@ -258,7 +259,7 @@ def radial_speed_crb_m2_s2(frequency_variance_hz2: float, rest_frequency_hz: flo
 
 
 def _horizontal_moments(positions_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Second moments S of the microphones in x and y, (2, 2), and the axis of the largest, (2,)."""
+    """Return the second moments of the microphones in x and y, (2, 2), and their main axis, (2,)."""
     positions = finite_array("positions_m", positions_m, (None, 3))
     horizontal = (positions - positions.mean(axis=0))[:, :2]
     moments = horizontal.T @ horizontal

@@ -5,8 +5,8 @@ r"""The published feature of 60 values: pair sums after the phase transform, two
           \qquad Z = X / |X|
 
 over the T_s frames of segment s, K bins of 50-1500 Hz and the P = M (M - 1) / 2 pairs: the modulus of a
-complex sum without the diagonal, between 0 and 1. As in the released data, azimuths run from -90 to 90 degrees,
-positive to the RIGHT; index 0 of each segment is +90 degrees (far left) in this library's convention.
+complex sum without the diagonal, between 0 and 1. As in the released data, azimuths run from -90 to 90
+degrees, positive to the RIGHT; index 0 of each segment is +90 degrees (far left) in this library.
 """
 
 from functools import lru_cache

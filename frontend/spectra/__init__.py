@@ -1,1 +1,1 @@
-"""From samples to spectra: hops, short-time Fourier transform, bands, phase transform."""
+"""Spectra of samples: hops, short-time Fourier transform, bands, phase transform."""

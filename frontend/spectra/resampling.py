@@ -1,4 +1,4 @@
-"""A stream at another rate, exact in blocks of any length: all channels resampled, or one decimated."""
+"""Rate conversion of a stream in blocks of any length: resampling of all channels, decimation of one."""
 
 from fractions import Fraction
 from math import ceil
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from worldstate.ground import FloatArray, in_range
 from worldstate.ground.typing import Float32Array
 
-# Attenuation of what aliases into the band, and of the ripple within it: the resolution of 16-bit converters.
+# Attenuation of aliases, and ripple within the band: the resolution of 16-bit converters.
 _ATTENUATION_DB = 80.0
-# Samples kept per period of the highest frequency: with 2 the filter would need an endless transition.
+# Samples per period of the highest frequency: with 2, the filter would need an infinite length.
 _OVERSAMPLING = 3.0
 
 
@@ -21,8 +21,8 @@ class Decimator:
 
     .. math:: y[m] = \sum_{n=0}^{L-1} h[n]\, x[m D + n], \qquad D = \lfloor f_s / 3 f_{high} \rfloor
 
-    with a linear-phase Kaiser low-pass, flat up to :math:`f_{high}`, closed from :math:`f_s / D - f_{high}`.
-    Only outputs whose L samples are all there are given; what is left over waits.
+    h is a linear-phase Kaiser low-pass filter with its pass band up to :math:`f_{high}` and its stop band
+    from :math:`f_s / D - f_{high}`. An output is returned when all of its L samples are available.
     """
 
     def __init__(self, sample_rate_hz: float, high_hz: float) -> None:
@@ -36,7 +36,7 @@ class Decimator:
         self._waiting: FloatArray = np.empty(0)
 
     def push(self, samples: NDArray[np.floating]) -> FloatArray:
-        r"""Take the next samples (n,) and return the outputs that they complete.
+        r"""Process the next samples (n,) and return the outputs that they complete.
 
         .. math:: y[m] = \sum_n h[n]\, x[m D + n]
         """
@@ -44,7 +44,7 @@ class Decimator:
         n_out = max((len(waiting) - self.n_taps) // self.factor + 1, 0)
         self._waiting, (step,) = waiting[n_out * self.factor :], waiting.strides
         windows = np.ndarray((n_out, self.n_taps), float, waiting, strides=(self.factor * step, step))
-        # Row by row: a product by BLAS depends in its last bit on how many rows there are.
+        # Row by row, because the last bit of a BLAS product depends on the number of rows.
         return np.asarray(np.einsum("ij,j->i", windows, self._taps))
 
 
@@ -53,37 +53,39 @@ def _low_pass(rate: float, high: float, low_rate: float) -> FloatArray:
     return _kaiser_taps(_kaiser_length(transition) | 1, low_rate / rate)
 
 
-# Kaiser windows of this attenuation and their length: J. F. Kaiser, "Nonrecursive digital filter design using
-# the I0-sinh window function", 1974. By numpy, since importing scipy.signal takes half a second.
+# Kaiser window for this attenuation, and its length: J. F. Kaiser, "Nonrecursive digital filter design using
+# the I0-sinh window function", 1974. With numpy, because importing scipy.signal takes half a second.
 _BETA = 0.1102 * (_ATTENUATION_DB - 8.7)
 
 
 def _kaiser_length(transition: float) -> int:
-    """Return the number of taps for a transition in parts of half the rate."""
+    """Return the number of taps for a transition width relative to half the rate."""
     return ceil((_ATTENUATION_DB - 7.95) / (2.285 * np.pi * transition) + 1.0)
 
 
 def _kaiser_taps(n_taps: int, cutoff: float) -> FloatArray:
-    """Return a low-pass of gain one up to a cutoff in parts of half the rate."""
+    """Return a low-pass filter with unit gain up to a cutoff relative to half the rate."""
     ideal = np.sinc(cutoff * (np.arange(n_taps) - 0.5 * (n_taps - 1)))
     taps = ideal * np.kaiser(n_taps, _BETA)
     return np.asarray(taps / taps.sum())
 
 
-# Share of half the lower rate: flat up to .9 of it as converters are, closed from 1.1 on.
+# Width relative to half the lower rate: pass band up to 0.9 of it, as in converters, stop band from 1.1.
 _TRANSITION = 0.2
-# 147:160 has the largest terms of the rates in use; at others the output is off by .4 % at most, and says so.
+# 147:160 has the largest terms among usual rates. At other rates the output rate differs by at most 0.4 %
+# from the requested one; `rate_hz` is exact.
 _LARGEST_TERM = 160
-# Outputs of one product: of fewer it is slow, of more most of its factors are zero.
+# Outputs per product: fewer are slow, and with more most factors are zero.
 _ROWS = 32
 
 
 class Resampler:
-    r"""Bring all channels to about another rate, without delay: output m lies at m D / U of the input.
+    r"""Convert all channels to approximately another rate, without delay.
 
     .. math:: y[m] = U \sum_n h[m D - n U]\, x[n], \qquad U / D \approx f_{out} / f_s
 
-    with a linear-phase Kaiser low-pass h. `rate_hz` is the exact rate of the output.
+    Output m is at m D / U of the input. h is a linear-phase Kaiser low-pass filter. `rate_hz` is the exact
+    rate of the output.
 
     Examples
     --------
@@ -93,9 +95,9 @@ class Resampler:
     48000
     """
 
-    # Groups of outputs are the same products of matrices: the same to the bit for blocks of any length. A hop
-    # of 56 channels from 44.1 to 48 kHz costs .6 ms so, 12 by `scipy.signal.upfirdn` and 3.2 by soxr, which
-    # gives the same 15 ms later instead of 4.
+    # Groups of outputs are the same matrix products for blocks of any length, so results are bit-identical. A
+    # hop of 56 channels from 44.1 to 48 kHz takes 0.6 ms; `scipy.signal.upfirdn` takes 12 ms and soxr 3.2 ms.
+    # The output is 4 ms late, that of soxr 15 ms.
 
     def __init__(self, n_channels: int, sample_rate_hz: float, wanted_hz: float) -> None:
         self._ratio = Fraction(wanted_hz / sample_rate_hz).limit_denominator(_LARGEST_TERM)
@@ -106,7 +108,7 @@ class Resampler:
         several = ceil(_ROWS / 2 / up)
         self._size, self._step = several * up, several * down
         self._width = self._step + 2 * half
-        # Row m: what output m of a group takes of the inputs from `half` before the group on.
+        # Row m: weights of the inputs, from `half` before the group, for output m of a group.
         index = np.arange(self._size)[:, None] * down - (np.arange(self._width) - 2 * half) * up
         rows = np.where((index >= 0) & (index < len(taps)), taps[index % len(taps)], 0.0).astype(np.float32)
         self._products: list[tuple[slice, slice, Float32Array]] = []
@@ -117,7 +119,7 @@ class Resampler:
         self._waiting: Float32Array = np.zeros((half, n_channels), np.float32)
 
     def push(self, samples: Float32Array) -> Float32Array:
-        """Take the next samples (n, M) and return the outputs that they complete."""
+        """Process the next samples (n, M) and return the outputs that they complete."""
         self._waiting = waiting = np.concatenate([self._waiting, samples])
         if len(waiting) < self._width:
             return waiting[:0]
@@ -129,7 +131,7 @@ class Resampler:
         return groups.reshape(-1, waiting.shape[1])
 
     def flush(self) -> Float32Array:
-        """Return the outputs up to the end of the stream, after which there is silence."""
-        # Groups begin at whole inputs: what waits, but for half a filter before it, is what is left.
+        """Return the outputs up to the end of the stream, as if silence followed."""
+        # Groups begin at whole inputs, so the waiting samples without half a filter determine the outputs.
         left = ceil((len(self._waiting) - (self._width - self._step) // 2) * self._ratio)
         return self.push(np.zeros((self._width, self._waiting.shape[1]), np.float32))[:left]

@@ -1,9 +1,9 @@
-r"""What one microphone hears, in numbers that do not depend on its level: modulation, tones, harmonics.
+r"""Character of the sound at one microphone, independent of its level: modulation, tones, harmonics.
 
-Band levels are read a hundred times a second; over the last two seconds their modulation spectrum, and the
-share of it that the bands have in common, tell steps, speech and blows from tyres and engines, whose bands
-fluctuate each by itself as noise does. A finer spectrum, once a hop, shows tones and combs of harmonics. How
-the level is shared between the bands tells a van from a car.
+Band levels are computed a hundred times per second. Over the last two seconds, their modulation spectrum and
+the share of it that is common to the bands distinguish steps, speech and impacts from tyres and engines,
+whose bands fluctuate independently as in noise. A finer spectrum, once per hop, shows tones and harmonic
+series. The distribution of the level over the bands distinguishes a van from a car.
 """
 
 import math
@@ -20,22 +20,22 @@ from .stft import fast_length, power
 
 HOPS_A_SECOND = 10
 EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)
-_HIGH = 4  # Bands from here on: below 450 Hz wind and engines are modulated, too
-_FRAMES, _SECOND, _MEMORY = 10, 100, 200  # Levels a hop, a second, and in the window
-_SHORT_S, _LONG_S = 0.032, 0.1706  # A syllable's onset; partials of a bell 6 Hz apart
-# Rates of modulation, Hz: swell, beats and steps, syllables (two), roughness (three).
+_HIGH = 4  # First high band: below 450 Hz, wind and engines are modulated too
+_FRAMES, _SECOND, _MEMORY = 10, 100, 200  # Number of levels per hop, per second, and in the window
+_SHORT_S, _LONG_S = 0.032, 0.1706  # To resolve the onset of a syllable; partials of a bell 6 Hz apart
+# Modulation rates, Hz: swell, beats and steps, syllables (two ranges), roughness (three ranges).
 _RATES_HZ = (0.4, 1.3, 2.8, 6.2, 10.2, 16.2, 30.2, 50.1)
 _TOGETHER_HZ = (0.4, 2.2, 8.2, 16.2, 50.1)
 _TONES_HZ = (80.0, 300.0, 900.0, 2700.0)
-_AROUND_HZ = 150.0  # Half the width over which the floor under a tone is averaged
+_AROUND_HZ = 150.0  # Half the width of the average that is the floor under a tone
 _COMB_S = (1.0 / 400.0, 1.0 / 75.0)  # Periods of voices, strings and motors
-_EXCESS = (-2.0, 4.0)  # Nats at which an excess is cut: one strong line is no comb
-_HEIGHTS = (4.0, 8.0)  # Nats above the floor: a line that noise hardly has, and one that counts most
+_EXCESS = (-2.0, 4.0)  # Limits of an excess, nats: a single strong line is no harmonic series
+_HEIGHTS = (4.0, 8.0)  # Nats above the floor: a line that noise rarely has, and the largest weight
 _PAUSE, _LAG, _SMOOTH = 0.7, 5, 5  # Nats below the median; frames between two levels, and in a mean
 _QUANTILES = (0.05, 0.5, 0.95)
-_FORGET_LINES, _FORGET_PEAKS = 0.1, 0.05  # A hop: means over one and over two seconds
-_STILL = 1e-6  # Modulation of a level that stays, far below that of any noise
-_LEAST = 1e-14  # Power of a silent band, far below a 24-bit converter's
+_FORGET_LINES, _FORGET_PEAKS = 0.1, 0.05  # Weight of a hop: means over one and over two seconds
+_STILL = 1e-6  # Modulation of a constant level, far below that of any noise
+_LEAST = 1e-14  # Power of a silent band, far below that of a 24-bit converter
 
 MEASURES = (
     *(f"modulation {part} {low:g}" for part in ("low", "high") for low in _RATES_HZ[:-1]),
@@ -44,12 +44,12 @@ MEASURES = (
     *(f"{name} {low:g}" for name in ("steady", "tonal", "peak") for low in _TONES_HZ[:-1]),
     *("comb", "comb varies", "line", "line varies", "line holds"),
 )
-# Levels of the last second over their mean: the street's own colour is in them, so that no guard reads them.
+# Levels of the last second relative to their mean. No guard uses them, because they depend on the street.
 BANDS = tuple(f"band {low:g}" for low in EDGES_HZ[:-1])
 
 
 class SoundCharacter:
-    """Take one microphone hop by hop and measure the last two seconds."""
+    """Measures the sound of one microphone over the last two seconds, hop by hop."""
 
     def __init__(self, sample_rate_hz: float) -> None:
         in_range("sample_rate_hz", sample_rate_hz, 2.0 * EDGES_HZ[-1], np.inf)
@@ -61,14 +61,14 @@ class SoundCharacter:
         self._frames = len(self._sound) + ends[:, None] + np.arange(-short, 0)
         self._window = np.hanning(short + 1)[:-1] / np.sqrt(short)
         self._size = fast_length(short)
-        # A mean: at another rate three bins or four lie within the same band.
+        # A mean, because at another rate the same band has three or four bins.
         self._means = np.ascontiguousarray(_means(EDGES_HZ, np.fft.rfftfreq(self._size, 1.0 / rate)).T)
         self._lines = _Lines(long, rate)
         self._levels: FloatArray = np.zeros((_MEMORY, len(EDGES_HZ) - 1))
         self._n_hops = 0
 
     def push(self, samples: NDArray[np.floating]) -> None:
-        """Take the samples of the next hop of 0.1 s, shape (n,)."""
+        """Process the samples of the next hop of 0.1 s, shape (n,)."""
         new = self._decimator.push(samples)
         self._sound = np.concatenate([self._sound, new])[len(new) :]
         self._levels[:-_FRAMES] = self._levels[_FRAMES:]
@@ -78,7 +78,7 @@ class SoundCharacter:
         self._n_hops += 1
 
     def read(self) -> FloatArray | NotUsable:
-        """Return `MEASURES` of the last two seconds and `BANDS` of the last, shape (measures + bands,)."""
+        """Return `MEASURES` of the last two seconds and `BANDS` of the last second, (measures + bands,)."""
         if self._n_hops <= _MEMORY // _FRAMES:
             return NotUsable("needs two seconds of sound")
         bands = mean(self._levels[-_SECOND:], 0)
@@ -87,7 +87,7 @@ class SoundCharacter:
 
 
 class _Lines:
-    """Tones and combs in spectra of long frames, as running means."""
+    """Tones and harmonic series in spectra of long frames, as running means."""
 
     def __init__(self, length: int, rate_hz: float) -> None:
         self._window = np.hanning(length + 1)[:-1] / np.sqrt(length)
@@ -100,19 +100,19 @@ class _Lines:
         self._left = np.maximum(np.arange(count) - half, 0)
         self._right = np.minimum(np.arange(count) + half + 1, count)
         self._taper = np.hanning(count + 2)[1:-1]
-        # Twice as long as the band: what lies at its ends is no neighbour.
+        # Twice as long as the band, so that its two ends are not neighbours.
         self._comb_size = fast_length(2 * count)
         low, high = (round(period * self._comb_size * self._step_hz) for period in _COMB_S)
         self._combs = slice(low, high)
         self._excess, self._ratio = np.zeros(count), np.ones(count)
         self._peaks: FloatArray = np.zeros(len(self._starts))
         self._log_hz = np.log(hz[self._band])
-        # Running means of what a moment says: the comb and its square; of the strongest line its weight, and
-        # by that weight its pitch and the square of it; whether it stands out at all.
+        # Running means: the height of the harmonic series and its square; the weight of the strongest line,
+        # its weighted pitch and squared pitch; whether this line is clearly above the floor.
         self._moments: FloatArray = np.zeros(6)
 
     def push(self, sound: FloatArray) -> None:
-        """Take the sound that ends now, at least one frame of it."""
+        """Process the sound that ends now, at least one frame."""
         frame = sound[-len(self._window) :]
         level = np.log(power(rfft(frame * self._window)[self._band]) + _LEAST)
         sums = np.concatenate([[0.0], level.cumsum()])
@@ -123,7 +123,7 @@ class _Lines:
         self._moments += _FORGET_PEAKS * (self._moment(excess) - self._moments)
 
     def read(self) -> FloatArray:
-        """Lines that stay, energy above the floor, the strongest line of each moment, harmonics."""
+        """Return steady lines, energy above the floor, peaks, harmonic series and strongest line."""
         steady = np.maximum.reduceat(self._excess, self._starts)
         tonal = np.log(np.add.reduceat(self._ratio, self._starts) / self._counts)
         comb, comb_square, weight, pitch, pitch_square, holds = self._moments.tolist()
@@ -138,7 +138,7 @@ class _Lines:
         return np.array([comb, comb * comb, weight, weight * pitch, weight * pitch * pitch, stands_out])
 
     def _combed(self, excess: FloatArray) -> float:
-        """Log of the highest line of the spectrum of the spectrum, over its mean."""
+        """Return the log of the highest line in the spectrum of the spectrum, relative to its mean."""
         low, high = _EXCESS
         clipped = np.minimum(np.maximum(excess, low), high)
         spectrum = power(rfft(clipped * self._taper, self._comb_size))
@@ -147,7 +147,7 @@ class _Lines:
 
 
 def _modulation(levels: FloatArray) -> FloatArray:
-    r"""Modulation spectrum by rate, low and high bands, and the share that the high bands have in common.
+    r"""Return modulation by rate for low and high bands, and the share that is common to the high bands.
 
     .. math:: m_r = \ln \langle |E_b(f)|^2 \rangle_{b, f \in r}, \qquad
               c_r = \ln \frac{\sum_{f \in r} |\sum_b E_b(f)|^2}{\sum_{f \in r} \sum_b |E_b(f)|^2}
@@ -161,7 +161,7 @@ def _modulation(levels: FloatArray) -> FloatArray:
 
 
 def _swings(levels: FloatArray) -> FloatArray:
-    """How far the level rises and falls, how long it pauses, and how fast bands change."""
+    """Return rise and fall of the level, share of pauses, and change in low and high bands."""
     sums = mean(levels[:, _HIGH:], 1).cumsum()
     smooth = (sums[_SMOOTH:] - sums[:-_SMOOTH]) / _SMOOTH
     smooth.sort()
@@ -172,7 +172,7 @@ def _swings(levels: FloatArray) -> FloatArray:
 
 
 def _means(edges_hz: tuple[float, ...], hz: np.ndarray) -> FloatArray:
-    """Means over the frequencies between edges, shape (bands, frequencies)."""
+    """Return the weights of means over the frequencies between edges, shape (bands, frequencies)."""
     inside = np.stack([(hz >= low) & (hz < high) for low, high in pairwise(edges_hz)])
     return np.asarray(inside / inside.sum(axis=1, keepdims=True))
 

@@ -1,6 +1,6 @@
-"""Spectra of a stream, exact in blocks of any length.
+"""Spectra of a stream, identical for blocks of any length.
 
-The short-time Fourier transform is of a range of bins; the phase transform leaves their phases alone.
+The short-time Fourier transform covers a range of bins; the phase transform keeps only their phases.
 """
 
 import numpy as np
@@ -8,12 +8,12 @@ import numpy as np
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, IntArray
 
-# Smallest power of a bin that is not silence: far below 24-bit quantisation, far above float32 underflow.
+# Smallest power of a bin with sound: far below 24-bit quantisation, far above float32 underflow.
 _POWER_FLOOR = np.float32(1e-30)
 
 
 def power(spectra: ComplexArray) -> np.ndarray:
-    """Squared magnitude ``|X|^2 = (Re X)^2 + (Im X)^2``, without a square root, same shape.
+    """Return the squared magnitude ``|X|^2 = (Re X)^2 + (Im X)^2``, same shape, without a square root.
 
     Examples
     --------
@@ -26,7 +26,7 @@ def power(spectra: ComplexArray) -> np.ndarray:
 
 
 def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Complex64Array:
-    r"""Phase transform :math:`Z = X / |X|`; bins without sound stay zero.
+    r"""Return the phase transform :math:`Z = X / |X|`; bins without sound remain zero.
 
     Source: C. Knapp and G. C. Carter, IEEE Trans. ASSP 24, 1976.
     """
@@ -37,7 +37,7 @@ def whiten(spectra: Complex64Array, powers: Float32Array | None = None) -> Compl
 
 
 def fast_length(least: int) -> int:
-    """Return the smallest length from `least` on whose transform is fast: of no prime factor above 5.
+    """Return the smallest length from `least` on with a fast transform: no prime factor above 5.
 
     Examples
     --------
@@ -52,33 +52,33 @@ def fast_length(least: int) -> int:
 
 
 def band_bins(band_hz: tuple[float, float], sample_rate_hz: float, nfft: int) -> range:
-    """Bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded."""
+    """Return the bins of a band by pyroomacoustics' rule: ``k = round(f N / fs)``, upper end excluded."""
     low, high = (int(np.round(frequency / sample_rate_hz * nfft)) for frequency in band_hz)
     got = f"got {band_hz} Hz"
     if not 0 <= low < high:
         raise InvalidArgumentError(f"band_hz: expected a band of at least one bin of {nfft}, {got}")
     if high > nfft // 2:
         expected = f"less than half the sample rate of {sample_rate_hz} Hz"
-        advice = "choose a lower band, or sound of a higher rate (simulate: --bandwidth)"
+        advice = "choose a lower band or a higher sample rate (simulate: --bandwidth)"
         raise InvalidArgumentError(f"band_hz: expected {expected}, {got}: {advice}")
     return range(low, high)
 
 
 def bin_frequencies_hz(bins: range, sample_rate_hz: float, nfft: int) -> np.ndarray:
-    """Centre frequencies ``f_k = k fs / N`` of the bins, Hz, shape (bins,)."""
+    """Return the centre frequencies ``f_k = k fs / N`` of the bins, Hz, shape (bins,)."""
     return np.arange(bins.start, bins.stop) * (sample_rate_hz / nfft)
 
 
 class StreamingStft:
-    r"""Hann-windowed STFT frames of `nfft` samples, overlapped by half, exact in blocks of any length.
+    r"""Hann-windowed STFT frames of `nfft` samples with half overlap, identical for blocks of any length.
 
     .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N},
               \qquad w[n] = \tfrac12 - \tfrac12 \cos(2 \pi n / N)
     """
 
-    # The first frame starts at the first sample; nothing is padded. A full FFT and decimation before it were
-    # both slower: every half frame is multiplied once by the wanted rows of the DFT matrix (one sgemm). Two
-    # neighbouring halves make a frame, the second with sign (-1)^k, and the Hann window is the three-tap
+    # The first frame starts at the first sample, without padding. Every half frame is multiplied once by the
+    # required rows of the DFT matrix (one sgemm); a full FFT and a decimation before it were both slower. Two
+    # neighbouring halves form a frame, the second with sign (-1)^k, and the Hann window is the three-tap
     # filter (-1/4, 1/2, -1/4) across bins (F. J. Harris, Proc. IEEE 66, 1978).
 
     def __init__(self, n_channels: int, nfft: int, bins: range) -> None:
@@ -87,7 +87,7 @@ class StreamingStft:
         if bins.step != 1 or not 0 <= bins.start < bins.stop <= nfft // 2 + 1:
             raise InvalidArgumentError(f"bins: expected a range within 0..{nfft // 2}, got {bins}")
         self.bins = bins
-        # One bin more on either side, for the window's taps.
+        # One more bin on each side for the taps of the window.
         wider = np.arange(bins.start - 1, bins.stop + 1)
         self._half_dft = _half_dft(wider, nfft)
         self._signs = ((-1.0) ** wider).astype(np.float32)[:, None]
@@ -96,7 +96,7 @@ class StreamingStft:
         self._previous: Float32Array | None = None
 
     def push(self, samples: Float32Array) -> Complex64Array:
-        r"""Take the next samples (n, M) and return the frames that they complete, (frames, bins, M).
+        r"""Process the next samples (n, M) and return the frames that they complete, (frames, bins, M).
 
         .. math:: X_t[k] = \sum_{n=0}^{N-1} w[n]\, x[t N/2 + n]\, e^{-j 2 \pi k n / N}
 
@@ -111,7 +111,7 @@ class StreamingStft:
         return _frames(halves[first:], self._signs)
 
     def _halves(self, samples: Float32Array) -> Float32Array | None:
-        """Transform the half frames that are full now, (1 + n, 2, bins + 2, M); the first is left open."""
+        """Transform the half frames that are now full, (1 + n, 2, bins + 2, M); the first is not filled."""
         size, n_channels = self._head.shape
         missing = size - self._n_head
         if len(samples) < missing:
@@ -132,7 +132,7 @@ class StreamingStft:
 
 
 def _half_dft(bins: IntArray, nfft: int) -> Float32Array:
-    """Real rows, then imaginary rows of the DFT over half a frame, (2 bins, nfft / 2)."""
+    """Return the real rows, then the imaginary rows of the DFT over half a frame, (2 bins, nfft / 2)."""
     phase = -2.0 * np.pi / nfft * np.outer(bins, np.arange(nfft // 2))
     return np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
 
