@@ -1,4 +1,4 @@
-"""Searched sectors, results of a co-evidence channel and its miss rate.
+"""Sectors that a second sensor searches, its results (co-evidence) and its miss rate.
 
 A result is present, absent or unqueried. Absence is a measurement and has its own type. A sensor that did
 not search the sector gives neither presence nor absence: `Unqueried`, beta = 1. The miss rate
@@ -269,7 +269,7 @@ class MissRateTable:
         self, azimuths_rad: FloatArray, degradation: float = 0.0, label: str | None = None
     ) -> FloatArray:
         """Return beta at several azimuths, shape (n,), and one degradation."""
-        # Called many times per hop: one comparison, which NaN fails too.
+        # A single comparison, because this runs many times per hop; NaN fails it too.
         if not 0.0 <= degradation <= 1.0:
             raise InvalidArgumentError(f"degradation: expected a number in [0, 1], got {degradation}")
         magnitude_deg = np.abs(np.degrees(azimuths_rad))
@@ -340,7 +340,7 @@ def isotonic_grid(values: ArrayLike, weights: ArrayLike) -> FloatArray:
 
 def _pooled_rows(values: FloatArray, weights: FloatArray) -> FloatArray:
     """Pool adjacent violators of every row."""
-    # Imported here because it takes 0.4 s, which a command that only prints its options would pay.
+    # Imported here to save 0.4 s in commands that do not need it.
     from scipy.optimize import isotonic_regression
 
     pairs = zip(values, weights, strict=True)

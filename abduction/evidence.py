@@ -129,7 +129,7 @@ class SignatureEvidence:
 
 
 def _nats(name: str, values: object, size: int) -> tuple[float, ...]:
-    """Return log-likelihoods as floats; raise an error on a wrong number of them or a value out of range."""
+    """Return log-likelihoods as floats after checks of their number and range."""
     if (type(values) is not tuple and not isinstance(values, Sequence | np.ndarray)) or len(values) != size:
         raise InvalidArgumentError(f"{name}: expected one value per direction, got {values!r:.80}")
     # Integers would create integer arrays, to which no likelihood can be added in place.
@@ -159,13 +159,13 @@ def with_bearing_vote(
     >>> [round(value, 1) for value in voted.hidden], with_bearing_vote(wrong, 0.7, 0.1, 0.0) == wrong
     ([0.7, -3.9], True)
     """
-    # If the sound is direct less often than a peak is a reflection on the other side, the bearing is unused.
+    # The sound is too rarely direct for its bearing to be used.
     if direct < 0.5 * _IMAGE or set(evidence.directions) != {"left", "right"}:
         return evidence
     hidden = np.array(evidence.hidden)
     total = float(np.logaddexp(*hidden))
     neutral = float(np.logaddexp(evidence.visible, evidence.none))
-    # Sums over two explanations replace the means: both differ from them by log 2.
+    # Sums replace the means over two explanations, because all of them differ by the same log 2.
     kept = np.log1p(-direct) if direct < 1.0 else -np.inf
     level = min(total, float(np.logaddexp(kept + total, np.log(direct) + neutral)))
     left = 0.5 * _IMAGE + (1.0 - _IMAGE) * 0.5 * math.erfc(-azimuth_rad / (math.sqrt(2.0) * std_rad))
@@ -354,7 +354,7 @@ def statistic(
     Raises
     ------
     InvalidArgumentError
-        Under the conditions of `abduce`, or if a prior is negative.
+        In the cases of `abduce`, or if a prior is negative.
 
     References
     ----------

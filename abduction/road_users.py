@@ -1,4 +1,4 @@
-r"""Kinds of road users from the sound at one microphone, and a guard against unknown kinds of sound.
+r"""Classification of road users by the sound at one microphone, and a guard against unknown sounds.
 
 Both are a softmax over classes. Its input x is the sound character of one microphone over two seconds:
 
@@ -35,8 +35,8 @@ SEEN_AS = {
     "bicycle": {"bicycle"},
     "tram": {"train"},
 }
-# Probability mass of the kinds that are looked up in the camera together. With fewer kinds, a wrong
-# classification of the sound would look for the wrong object.
+# Total probability of the kinds that are searched for in the camera image. With fewer kinds, a wrong
+# classification would lead to a search for the wrong object.
 _ASKED = 0.95
 _ROUNDING = 1e-6
 ClassShares: TypeAlias = tuple[tuple[str, float], ...]
@@ -44,7 +44,7 @@ ClassShares: TypeAlias = tuple[tuple[str, float], ...]
 
 
 def class_shares(name: str, value: object) -> ClassShares:
-    """Return classes with their probabilities, sorted; raise an error if the value is none.
+    """Return classes with their probabilities, checked and sorted.
 
     Examples
     --------

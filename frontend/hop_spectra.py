@@ -1,7 +1,6 @@
 """Hops of a stream without drift, and the sums per hop that make up windows.
 
-This file also has the band levels of a hop, averaged over some microphones, and the detection of noise that
-is unusual for the place.
+This module also computes the band levels of a hop and detects noise that is unusual for the place.
 """
 
 import math
@@ -292,8 +291,7 @@ class LevelMeter:
 
         All frames are usable by default; without usable frames the result is that of silence.
         """
-        # The average is over the selected microphones that are kept (M,), or over all selected ones if none
-        # is.
+        # Average over the selected microphones that are kept (M,), or over all of them if none is kept.
         powers = power(self._stft.push(np.ascontiguousarray(samples[:, self._channels])))
         if heard is not None and False in heard:
             powers = powers[heard]
@@ -317,8 +315,7 @@ _NOISE_DB = (6.0, 12.0)
 # and no hop is masked in five minutes of busy simulated streets. Of 394 real clips, one of 29 idling engines
 # is masked, no siren of 32, and 27 of 29 shots.
 _JUMP_DB, _JUMP_HOPS = (6.0, 10.0), 3
-# A masking noise ends when it falls by this much below its loudest hop; after ten seconds it is usual for the
-# place.
+# A masking noise ends when it falls by this much below its loudest hop, or after ten seconds.
 _END_DB, _LONGEST_HOPS = 5.0, 100
 # Excess of the lowest over the highest quarter of the bands that only wind causes.
 _WIND_DB = 10.0
@@ -349,7 +346,7 @@ class NoiseMeter:
         self._quiet: FloatArray = np.zeros(BANDS)
         self._usual_coherence = 0.0
         self._recent: deque[float] = deque(maxlen=_JUMP_HOPS)
-        # Level before a jump, highest level since then, and hop of its begin; None without a jump.
+        # Level before a jump, highest level since then, and first hop of the jump; None without a jump.
         self._jump: tuple[float, float, int] | None = None
 
     def skip(self) -> None:
@@ -360,7 +357,7 @@ class NoiseMeter:
     def push(
         self, levels: FloatArray, coherence: float, common: tuple[float, str | None] = (1.0, None)
     ) -> tuple[float, str | None]:
-        """Return the usable share of a hop from its log-energies (bands,) and coherence, and a reason.
+        """Return the usable share of a hop, from its log-energies (bands,) and coherence, with the reason.
 
         `common` is the usable share without the comparison of levels; a hop that is unusable in this way does
         not change the usual level.

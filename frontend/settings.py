@@ -51,7 +51,7 @@ class FrontEndSettings:
     feature_order : tuple of int, optional
         Order of the channels in the pairs of the feature, if it is not that of the array.
     heard_rate_hz : float, optional
-        Rate to which the sound is resampled before everything but the check of microphones; None keeps it.
+        Rate to which the sound is resampled, except for the check of microphones; None: no resampling.
 
     Raises
     ------

@@ -139,12 +139,13 @@ __all__ = ["AcousticFrame", "FrontEnd"]
 
 # Far above full scale of any converter; the power of an STFT frame is still within single precision.
 _LOUDEST = 1e15
-# Usable share of a window. With 0.6 s lost, the feature and the evidence of a side change by as much as
-# within half a second (medians 0.08 of 0.10 and 0.29 of 0.30 nats, twelve simulated demos); with 0.7 s lost
-# by 0.39 nats.
+# Usable share of a window. With 0.6 s lost, the errors of the feature and of the side evidence are as large
+# as their changes within half a second (medians 0.08 against 0.10, and 0.29 against 0.30 nats, twelve
+# simulated demos); with 0.7 s lost the latter is 0.39 nats.
 _LEAST_OF_WINDOW = 0.4 - 1e-9
 # A tenth of a second is too short for the feature. In fourteen demos after a lost second, the probability of
-# an approaching vehicle is 0.349 with it, 0.361 if the whole window replaces it, and 0.43 without the loss.
+# an approaching vehicle is 0.349 with this feature, 0.361 if that of the whole window replaces it, and 0.43
+# without the loss.
 _LEAST_OF_HALF = 0.3
 # The energy of less than half a hop varies too much for a point of the looming fit.
 _LEAST_OF_HOP = 0.5
@@ -441,7 +442,6 @@ class FrontEnd:
     def _looming(self, end: int) -> Looming | NotUsable:
         window = self._window
         hops = (window["n_frames"] >= _LEAST_OF_HOP * np.maximum(window["n_new"], 1)).nonzero()[0]
-        # The same microphones over the whole window, because a failure of one must not look like a change of
-        # level.
+        # The same microphones over the whole window, so that a failure does not look like a change of level.
         energies = mean(window["energies"][:, self._used], 1)[hops]
         return looming_of((window["centre"][hops] - end) / self.heard_rate_hz, energies, self._energy_floor)

@@ -23,7 +23,7 @@ class CueingPolicy:
     gamma : float
         An alarm requires a statistic of at least this value.
     sustain_hops : int
-        Number of consecutive hops for which this has to hold.
+        Number of consecutive hops that have to reach gamma.
     alpha : float
         Share of hazard-free windows in alarm for which gamma was set.
     reference_prior : tuple of float

@@ -179,7 +179,7 @@ def fit_risk_map(statistics: ArrayLike, hazards: ArrayLike, independent: float |
     Raises
     ------
     InvalidArgumentError
-        Under the conditions of `fit_isotonic`.
+        In the cases of `fit_isotonic`.
 
     References
     ----------

@@ -342,7 +342,7 @@ def ground(
               \frac{p(o \mid c, v)\, p(\hat v \mid v)}{p_0}
               + \log \sum_\theta P(\theta \mid h)\, \frac{p(\hat\theta \mid \theta)}{p_0}
 
-    for h hidden or visible, with p_0 the density without a source; that of none does not change.
+    for h hidden or visible, with p_0 the density without a source. The evidence of none does not change.
 
     Parameters
     ----------

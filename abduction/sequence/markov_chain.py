@@ -15,7 +15,7 @@ _LEAST_SHIFT, _LARGEST_SHIFT = -0.5, 2.0
 
 
 def at_prior(posterior: FloatArray, share: FloatArray, prior: FloatArray) -> FloatArray:
-    r"""Return a posterior for another prior than the one of its training, shapes (..., groups).
+    r"""Return a posterior at another prior than that of its training, shapes (..., groups).
 
     .. math:: q^c \propto q\, c / \pi
 

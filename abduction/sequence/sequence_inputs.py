@@ -72,7 +72,7 @@ _BAND_COLUMNS = slice(_BEARING + 1, _BEARING + 1 + BANDS)
 _FOLLOWED = [_LOUDNESS, *range(_HIGHEST)]
 _EACH = np.arange(len(_FOLLOWED))
 _CHANGED = [_LOUDNESS, *range(_BAND_COLUMNS.start, _BAND_COLUMNS.stop), 0, 1]
-# Values with a usual value in the street: first levels (20 % quantile), then evidence (median).
+# Values that are compared with usual ones in the street: levels (20 % quantile), then evidence (median).
 USUAL = (*_BANDS, "level", "loudness", "left", "right", "visible")
 _LEVELS = BANDS + 2
 _EVERY = (
@@ -122,7 +122,7 @@ def hop_columns(
     `sides`, shape (n, 2), are the log ratios of hidden on the left and on the right to visible or none;
     `visible` is the log ratio of visible to none. A looming rate or a bearing is NaN if it was not usable.
     """
-    # In double precision: files store the energy in half precision, and so would be its logarithm.
+    # In double precision, because files store the energy in half precision.
     energy = np.asarray(band_log_energy, np.float64)
     # An unusable rate becomes 0 with the deviation of an unknown rate.
     refused = ~np.isfinite(looming_hz)
@@ -139,7 +139,7 @@ def hop_columns(
 
 
 def streets_own(columns: FloatArray) -> FloatArray:
-    """Return the columns whose usual values over a minute are used, in the order of `USUAL`."""
+    """Return the columns `USUAL`, whose usual values are computed over a minute."""
     return np.asarray(columns[:, _OWN])
 
 
@@ -152,7 +152,7 @@ def sequence_inputs(columns: FloatArray) -> FloatArray:
     True
     """
     own, ends = streets_own(columns), range(1, len(columns) + 1)
-    # With the same function as a reader, so that training and operation agree to the bit.
+    # The same function as in operation, so that training and operation agree bit for bit.
     rows = [last_inputs(columns[max(n - MEMORY_HOPS, 0) : n], own[max(n - QUIET_HOPS, 0) : n]) for n in ends]
     return np.concatenate(rows) if rows else np.zeros((0, len(SIDES), len(INPUTS)))
 

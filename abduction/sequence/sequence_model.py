@@ -22,7 +22,7 @@ from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 
 from .sequence_inputs import INPUTS, SIDES, sequence_inputs
 
-# Limits on the work that a foreign file can cause; 64 leaves fit the bits of a word.
+# Limits on the work that a foreign file can cause; a tree has at most 64 leaves, one per bit of a word.
 MOST_TREES, MOST_NODES, MOST_INPUTS = 4096, 127, 512
 
 
@@ -60,12 +60,12 @@ class BoostedTrees:
     value: FloatArray  # shape (trees, nodes): Values of leaves
     tree_class: IndexArray  # shape (trees,): Class to whose score a tree contributes
     baseline: FloatArray  # shape (classes,)
-    # Different tests of all trees: input and threshold. Per test of a tree: its number among the different
-    # ones, and the bits of the leaves that remain after "no". Then the values of the leaves.
-    _asked: IndexArray = field(init=False, repr=False)  # shape (different ones,)
-    _limit: FloatArray = field(init=False, repr=False)  # shape (different ones,)
-    _which: IndexArray = field(init=False, repr=False)  # shape (questions, trees)
-    _left: AnyArray = field(init=False, repr=False)  # shape (questions, trees)
+    # Different tests of all trees (input and threshold); per tree and test, its index among them and a mask
+    # of the leaves that remain after "no"; values of the leaves.
+    _asked: IndexArray = field(init=False, repr=False)  # shape (different tests,)
+    _limit: FloatArray = field(init=False, repr=False)  # shape (different tests,)
+    _which: IndexArray = field(init=False, repr=False)  # shape (tests, trees)
+    _left: AnyArray = field(init=False, repr=False)  # shape (tests, trees)
     _leaves: FloatArray = field(init=False, repr=False)  # shape (trees, leaves)
 
     def __post_init__(self) -> None:
@@ -260,14 +260,14 @@ class AlarmCurve:
     """
 
     threshold_nats: FloatArray  # shape (points,)
-    onsets_per_hour: FloatArray  # shape (points,): Maximum so far, as alarms may merge at lower thresholds
+    onsets_per_hour: FloatArray  # shape (points,): Maximum so far, as alarms merge at lower thresholds
     onsets_low: FloatArray  # shape (points,): 95 % interval at four other junctions
     onsets_high: FloatArray  # shape (points,)
     alpha: FloatArray  # shape (points,): Share of the hops in alarm
     alpha_low: FloatArray  # shape (points,)
     alpha_high: FloatArray  # shape (points,)
     hours: float  # Duration of the hazard-free streams
-    least_onsets: float  # A budget with fewer expected onsets in these hours would be set by chance
+    least_onsets: float  # Fewest expected onsets in these hours; with fewer, chance would decide
 
     def __post_init__(self) -> None:
         thresholds, *names = (one.name for one in fields(self)[:-2])

@@ -1,4 +1,4 @@
-"""A sequence model applied hop by hop: the stored part of a stream and the posterior of both sides."""
+"""Application of a sequence model to a stream, hop by hop."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,7 +21,7 @@ TOO_FEW = NotUsable(f"less than {LEAST_HOPS} hops of evidence")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceHistory:
-    """Stored part of a stream: eight seconds of its evidence and a minute of values usual in its street.
+    """Stored part of a stream: eight seconds of its evidence and a minute of the columns `USUAL`.
 
     Examples
     --------
@@ -91,7 +91,7 @@ class SequenceReading:
 
 
 class SequenceReader:
-    """Compute hop by hop the posterior that `SequenceModel.posterior` computes for a whole stream.
+    """Computes hop by hop the posterior that `SequenceModel.posterior` computes for a whole stream.
 
     Examples
     --------

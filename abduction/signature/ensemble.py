@@ -51,7 +51,7 @@ def site_reference(levels: ArrayLike) -> FloatArray:
     .. math:: r = \big(\langle x \rangle,\; \mathrm{median}\, x,\;
               \langle x \mid \max_a x_a \le q_{0.35} \rangle\big)
 
-    The last summary is the mean over the 35 % of the windows with the lowest loudest feature. It approximates
+    The last summary is the mean over the 35 % of the windows whose largest feature is lowest. It approximates
     the site without vehicles, whatever the share of such windows is.
 
     Shapes: levels (windows, features), natural logarithms; returns (3 * features,).

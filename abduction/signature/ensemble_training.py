@@ -24,7 +24,7 @@ SIMULATED_WEIGHT, OTHER_SIDE = 1.0, 0.25
 # Part of a real window's weight that is used with the site estimate before that window. A larger part reduces
 # the AUROC at the worst junction by 0.01 for a standing ego; without it, a moving ego loses 0.01.
 HEARD_PART = 0.25
-# Name of the site of sounds without a street, which are used for every selection of sites.
+# Site name of sounds without a street; training uses them whatever sites are left out.
 OPEN_FIELD = "open field"
 _ITERATIONS = 1000
 _WINDOW_S = 1.0
@@ -36,7 +36,7 @@ class Recipe:
     """View and ridge penalty of one expert."""
 
     view: str  # See `Expert`
-    ridge: float  # Factor of half the squared norm of the coefficients, > 0; the mean log loss has 1
+    ridge: float  # Factor of half the squared norm of the coefficients relative to the mean log loss, > 0
 
 
 # Chosen on eight junctions, each choice evaluated on a junction that was not used for it: lab/NOTES.md.
@@ -55,7 +55,7 @@ class SimulatedWindows:
 
     X: FloatArray  # shape (n, 4 * features); a reference of NaN is replaced by that of the training sites
     y: TextArray  # shape (n,): Names of `WINDOW_CLASSES`
-    sites: TextArray  # shape (n,): Names as for real sites: a left-out site is left out of both
+    sites: TextArray  # shape (n,): Site names; a left-out site is excluded from real and simulated windows
     weights: FloatArray  # shape (n,): Relative to a real window of weight 1
     other_side: FloatArray  # shape (n,): Part of a hazard's weight that has the label of the other side
 

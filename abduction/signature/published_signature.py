@@ -40,7 +40,7 @@ class ModelDomain:
     feature : str
         Name and version of the feature.
     ego_motion : {"standing", "moving", "any"}
-        State of the ego vehicle.
+        Motion of the ego vehicle.
     fastest_mps : float, optional
         Maximum speed; None in files without this value.
 

@@ -1,8 +1,8 @@
 r"""Estimate of a site's reference during operation: an unlabelled running mean with a forgetting time.
 
-A stream consists mostly of an empty street, but the training windows do not. The mean of a stream is
-therefore lower than the references of the training sites and would make every window look like a hazard.
-Instead, the estimate uses the difference between this mean and the mean empty window of the training sites,
+Most of a stream has no vehicle, unlike the training windows. The mean of a stream is therefore lower than the
+references of the training sites and would make every window look like a hazard. Instead, the estimate uses
+the difference between this mean and the mean empty window of the training sites,
 
 .. math:: d = \bar x - x_{empty}, \qquad
           r = r_{home} + w \big( \tfrac{1}{4} \langle d \rangle + d - \langle d \rangle \big),
@@ -14,8 +14,8 @@ costs a tenth of the detections at unknown junctions with a standing ego. A quar
 sufficient for a moving ego.
 
 The model sets the duration after which the stream has more weight than the training sites: the variance of
-empty windows at one site divided by that between sites. It is one second for a moving ego, whose sites differ
-much, and four seconds for a standing one.
+empty windows at one site divided by that between sites. This duration is one second for a moving ego, whose
+sites differ much, and four seconds for a standing one.
 """
 
 import math

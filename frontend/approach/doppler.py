@@ -127,8 +127,8 @@ _MOST_DISAGREEMENT, _MOST_MISFIT = 4.0, 4.0
 _JITTER = 3e-4
 # Least difference in BIC to each alternative; 10 is "very strong" on the usual scale.
 _LEAST_GAIN = 10.0
-# Limits for the slope of the line's level over -20 log10 of the fitted range, which is 1 in the free field,
-# and their least correlation. The level of an engine that slows down at the kerb does not change.
+# Limits for the slope of the line's level over -20 log10 of the fitted range (1 in the free field), and their
+# least correlation. The level of a slowing engine at the kerb remains constant.
 _LEVEL_GAINS, _LEAST_CORRELATION = (0.4, 2.5), 0.8
 _MOST_STD_M_S = 1.0  # Median standard deviation of the radial speed over the track
 

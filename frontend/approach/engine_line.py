@@ -1,9 +1,9 @@
 r"""Track the fundamental of an engine from its harmonics.
 
-There are three steps. The harmonic sum scores every candidate in every window, and `best_path` selects the
-track with the highest total score. The frequency of each partial is then measured along this track
-(`Windows`). Finally, all partials are combined into the fundamental and its variance. Their reduced
-chi-squared checks harmonic consistency: it is near one if the partials are multiples of one fundamental.
+The harmonic sum scores every candidate in every window, and `best_path` selects the track with the highest
+total score. The frequency of each partial is then measured along this track (`Windows`). Finally, all
+partials are combined into the fundamental and its variance. Their reduced chi-squared checks harmonic
+consistency: it is near one if the partials are multiples of one fundamental.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -29,7 +29,7 @@ _PARTIAL_PRICE = 1.0
 _FLOOR_WIDTH_HZ = 250.0  # Width of the running median that estimates the noise floor
 
 
-# Range of the fundamental that the window resolves (firing frequencies are 20 to 200 Hz); number of partials.
+# Range of the fundamental that the window resolves (firing frequencies: 20 to 200 Hz); most partials used.
 LOW_HZ, HIGH_HZ, MOST_HARMONICS = 25.0, 200.0, 20
 
 
@@ -222,7 +222,7 @@ def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
 
 
 def _newton_shift(demodulated: Complex128Array, n: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the Newton step from d = 0 to the peak of |sum z exp(-j d n)|^2, and its value; d in rad."""
+    """Return the Newton step (rad) from d = 0 to the peak of |sum z exp(-j d n)|^2, and the peak value."""
     s0, s1, s2 = (demodulated @ np.stack([np.ones_like(n), n, n**2], axis=1)).T
     height = np.abs(s0) ** 2
     slope = 2.0 * (s0.conj() * s1).imag

@@ -4,7 +4,7 @@ For a point source at range d the band energy E goes as 1/d^2, eq. (2):
 
 .. math:: \frac{d}{dt} \log E = -2 \frac{\dot d}{d} = \frac{2}{\mathrm{TTA}}
 
-It depends neither on the source level nor on the distance nor on a constant attenuation. One window gives two
+It does not depend on the source level, the distance or a constant attenuation. One window gives two
 estimates:
 
 * the slope of log E over the window, which is 2 / TTA near its middle;
@@ -225,8 +225,8 @@ def _fit_line(design: FloatArray, values: FloatArray, weights: FloatArray | None
     return _Line(slope, level, scatter)
 
 
-# An approach is audible for three to six seconds. Of half a minute, the lower third is then still noise; of
-# less than five seconds it is not.
+# An approach is audible for three to six seconds. The lower third of half a minute is therefore noise; that
+# of less than five seconds is not.
 _LONGEST_HOPS, _FEWEST_HOPS = 300, 50
 _Z10, _Z30 = -1.2816, -0.5244
 # With a shorter history, the noise is between zero and the lowest energy of the window.
@@ -252,7 +252,7 @@ class EnergyFloor:
             self._log_energies.append(math.log(energy))
 
     def read(self, lowest: float, least_log_std: float) -> tuple[float, float]:
-        """Return mean and deviation; for a short history, zero with a deviation from the lowest energy."""
+        """Return mean and deviation; for a short history, zero and a share of the lowest energy."""
         count = len(self._log_energies)
         if count < _FEWEST_HOPS:
             return 0.0, _UNKNOWN_SHARE * lowest

@@ -230,7 +230,7 @@ class ToneReading:
 
 
 class ToneStage:
-    r"""Tracks a tone in the last second of one averaged channel.
+    r"""Fits a tone to the last second of one averaged channel.
 
     Some microphones near the centre of the array are averaged. At engine frequencies they are within a
     fraction of a wavelength, so a tone from any direction adds up. A `Decimator` reduces the band to about
@@ -296,7 +296,7 @@ class ToneStage:
         return ToneReading(omega * self._rate / (2.0 * np.pi), std, snr)
 
     def _set_microphones(self, keep: BoolArray) -> None:
-        """Average the usable microphones nearest to the centre."""
+        """Select the usable microphones nearest to the centre for the average."""
         chosen = self._array.nearest(keep)[:_MOST_CHANNELS]
         self._keep, self._weights = keep.copy(), np.zeros(len(keep), np.float32)
         self._weights[chosen] = 1.0 / len(chosen)

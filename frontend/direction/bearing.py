@@ -8,8 +8,8 @@ The steered response power after the phase transform over T frames, K bins and M
 is 1 for a single plane wave from theta and 1/M for noise that is independent between microphones. The SRP of
 pyroomacoustics is M^2 / pairs = 2 M / (M - 1) times as large.
 
-A spatial spectrum has several peaks, and because of noise and reflections the highest peak is not always the
-source. The accuracy depends on the ratio of the wave's power to the remaining power,
+Because of noise and reflections, the highest peak is not always the source. The accuracy depends on the ratio
+of the wave's power to the remaining power,
 
 .. math:: \gamma = \frac{\hat P - \bar P}{1 - \hat P}, \qquad \bar P = \mathrm{median}_\theta P.
 
@@ -134,9 +134,9 @@ def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
     return normalised(steered_power(whiten(spectra), steering), n_frames, n_bins, n_microphones)
 
 
-# Only this share of the excess that noise reaches with three deviations over all directions counts as noise.
-# The peak of a visible vehicle is below the full excess in a quarter of the hops with 4 microphones, and an
-# accepted bearing of noise has a stated deviation of 50 degrees, because noise has many peaks.
+# Only this share of the excess that noise reaches with three deviations is considered noise. With 4
+# microphones, the peak of a visible vehicle is below the full excess in a quarter of the hops. Accepted noise
+# does little harm: with its many peaks, the bearing has a stated deviation of 50 degrees.
 _DEVIATIONS, _SHARE = 3.0, 0.6
 _ALL_ROUND_RAD = np.radians(np.arange(-180.0, 180.0, 10.0))
 
@@ -282,8 +282,8 @@ def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: f
 # rings of 4 to 8 microphones, 3 to 10 cm, and visible vehicles in simulated streets with 56, 14, 7 and 4
 # microphones.
 _DISPLACEMENT, _TEMPERATURE = 0.024, 0.0125
-# Elevations between the two of the search displace the azimuth of an array that is not horizontal: single
-# waves at random arrays have errors of 1.1 degrees. Also the least remaining power, to avoid rounding errors.
+# The search has only two elevations, so single waves at random arrays that are not horizontal have azimuth
+# errors of 1.1 degrees. Also the least remaining power, to avoid rounding errors.
 _LEAST_STD_RAD, _LEAST_REST = float(np.radians(1.0)), 1e-3
 
 
@@ -340,7 +340,7 @@ _APART, _KEEP, _SPREAD_RAD = 5, math.exp(-1.0 / 300.0), float(np.radians(10.0))
 
 
 class BearingScatter:
-    r"""Contradiction between the bearings of a stream, for example due to reflections.
+    r"""Increases standard deviations if the bearings of a stream contradict each other, as with reflections.
 
     .. math:: \sigma_k'^2 = \sigma_k^2 + \frac{\sum_{j \le k} a^{k-j} w_j (\theta_j - \theta_{j-5})^2}
               {\sum_{j \le k} a^{k-j} w_j}, \qquad

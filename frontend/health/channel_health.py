@@ -156,7 +156,7 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
     error = _prediction_error(change)
     np.square(error, out=error)
     error /= np.maximum(mean(error, 1), _TINY)[:, None]
-    # An upper bound of J, without the limit: sufficient for a clean hop.
+    # An upper bound of J is sufficient for a clean hop.
     if 2.0 * float(mean(error, 0).max()) < _JUMP_LIMIT:
         return []
     np.minimum(error, _JUMP_CEILING**2, out=error)
@@ -385,6 +385,6 @@ def faults_where(fault: Fault, found: BoolArray, values: FloatArray) -> list[Cha
 def repeated(
     found: list[ChannelFault], before: list[ChannelFault]
 ) -> tuple[list[ChannelFault], list[ChannelFault]]:
-    """Return the faults that were also found the last time, and all faults for the next comparison."""
+    """Return the faults that were found twice in a row, and all faults for the next comparison."""
     known = {(one.channel, one.fault) for one in before}
     return [one for one in found if (one.channel, one.fault) in known], found

@@ -32,7 +32,7 @@ ARRAY_FAULTS = NOTHING_IN_COMMON, OUT_OF_PLACE
 _LEAST_COHERENCE = 0.1
 # Number of microphones, evenly spaced: 12 of 56 separate sound from noise as well as all, ten times faster.
 _MOST_CHANNELS = 12
-# Weight of earlier hops, about half a second: short enough to detect noise, while one hop varies too much.
+# Weight of earlier hops, about half a second, because a single hop of four microphones varies too much.
 _KEPT = np.float32(0.8)
 # Power of a sum of T independent frames divided by T: neighbours share half a Hann window (correlation 1/6).
 _OVERLAP = 1.0 + 2.0 / 36.0
@@ -54,9 +54,8 @@ _COVERED_HOPS = 3
 # Misfit of a second: at most 0.32 in clean streets of both renderers with 11 arrays of 4 to 56; mostly 0.7 to
 # 1.3 for channels in random orders; 0.7 to 1 during seven seconds of a siren with equally long echoes.
 _MISFIT = 0.4
-# Change of the agreement per second, and its range. A right order fits repeatedly, and a siren makes it
-# negative only if it lasts twice as long as the fits before. Three seconds that fit make a negative agreement
-# positive.
+# Change of the agreement per second, and its range. In a right order, a siren makes the agreement negative
+# only if it lasts twice as long as the fitting sound before. Three fitting seconds make it positive again.
 _VOTES, _AGREEMENT = (-0.5, 1.0), (-3.0, 20.0)
 _EVERY_HOPS = 10
 
@@ -112,7 +111,7 @@ class CommonSound:
         return share, NOTHING_IN_COMMON if share < 1.0 else None
 
     def _compare_noise(self) -> None:
-        """Add the share of sound without independent noise, from the whole band and from its bins."""
+        """Store the share of sound without independent noise, from the whole band and from its bins."""
         if not self._decides:
             return
         noise, (scatter, scatter_of_all) = self._noise / self._n_frames**2, self._scatter
@@ -159,8 +158,7 @@ class FarField:
     r"""Comparison of coherences with those of far sources at the positions of the microphones, (M, 3).
 
     Far from all sources, the coherence r of a pair depends only on its displacement d and the wave number k.
-    Over all directions of a wave, the real parts of two pairs have the covariance C+ and the imaginary parts
-    C-,
+    Over all directions of a wave, the real parts of two pairs have covariance C+, the imaginary parts C-,
 
     .. math:: C^\pm_{ab} = \tfrac12 \big( \mathrm{sinc} |k_a d_a - k_b d_b|
               \pm \mathrm{sinc} |k_a d_a + k_b d_b| \big), \qquad
@@ -205,7 +203,7 @@ class FarField:
 
 
 def _in_any_order(weights: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return the mean of weights (KP, KP) over all orders of the microphones; `ends` of pairs, (P, M)."""
+    """Return the mean of weights (KP, KP) over all orders of the microphones; `ends` are those of pairs, (P, M)."""
     # The mean depends only on the number of microphones that two pairs share, and on the sign.
     shared, one = ends @ ends.T, np.eye(len(ends))
     groups = [one, shared - 2.0 * one] + ([(shared == 0.0).astype(float)] if (ends >= 0.0).all() else [])

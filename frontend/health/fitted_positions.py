@@ -37,18 +37,17 @@ _SIZES = (1.0, 0.5, 0.6, 0.7, 0.85, 1.18, 1.43, 1.67, 2.0)
 # Longest delay relative to the extent; largest residual of parts with a single wave relative to the median,
 # and number of selections; two steps of the tested delays relative to the longest delay.
 _LONGEST, _PLAIN, _ROUNDS, _FINE = 1.5, 2.0, 3, 0.02
-# Mean of the unit vectors towards all parts above which they do not determine the extent along this
-# direction. Two sources 20 degrees apart in the open have 0.99, and the errors remain as large as before; two
-# sources 60 degrees apart in a room have 0.83, with errors of 5 mm. True positions explain a share of 0.66 or
-# more (rooms with 0.8 s of reverberation, talkers 2.5 m away).
+# If the mean of the unit vectors towards all parts is longer than this, they do not determine the extent
+# along its direction. Two sources 20 degrees apart in the open have 0.99, and the errors remain as large as
+# before; two sources 60 degrees apart in a room have 0.83, with errors of 5 mm. True positions explain a
+# share of 0.66 or more (rooms with 0.8 s of reverberation, talkers 2.5 m away).
 _ONE_SIDE, _LEAST_EXPLAINED = 0.95, 0.6
 # Smallest unexplained share of the coherent energy, so that a perfect fit has a finite logarithm.
 _LEAST_LEFT = 1e-3
 # Step of the numerical gradient, in extents of the array: directions are 5 degrees apart, and with smaller
 # steps the discrete change of the best direction disturbs the gradient.
 _STEP = 2e-3
-# Relative gain at which the descent ends: a smaller value takes four times as long and changes less than 0.1
-# mm.
+# Relative gain at which the descent ends: a smaller value takes four times as long for less than 0.1 mm.
 _FALL = 1e-4
 # Ratio of the extent along an axis to the largest extent below which the array is flat along this axis.
 _FLAT = 0.05

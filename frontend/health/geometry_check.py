@@ -1,6 +1,6 @@
 """Positions, polarity, delays and clocks of the channels, checked once per second by common waves.
 
-Plane waves from all directions give the directions of the sound, and the order of many channels that fits.
+Plane waves give the directions of the sound and, for many channels, the order that fits.
 """
 
 from collections import deque
@@ -156,11 +156,11 @@ class Card:
 
     channels: BoolArray  # shape (M,)
     amount: float
-    sensitivity: float  # Length of the part of its pattern that a tilt of all waves does not explain
+    sensitivity: float  # Length of the part of its pattern that no other sound direction explains
 
 
 def untilted(positions_m: FloatArray, known: BoolArray) -> FloatArray:
-    r"""Return the projection that removes a tilt of all waves, i.e. another direction, from channel values.
+    r"""Return the projection that removes the effect of another sound direction from channel values.
 
     .. math:: Q = I - X (X^T X)^+ X^T, \qquad X = [1, p]
 
@@ -197,7 +197,7 @@ def runs(n_channels: int) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _untilted_runs(positions_m: bytes, known: bytes) -> tuple[FloatArray, FloatArray]:
-    """Return the matrix of `untilted` and the power of every run after it; cached, 0.5 ms for 56 channels."""
+    """Return the matrix of `untilted` and the power of every run after it; 0.5 ms for 56 channels."""
     free = untilted(np.frombuffer(positions_m).reshape(-1, 3), np.frombuffer(known, bool))
     candidates = runs(len(free))
     return free, np.add.reduce(candidates @ free * candidates, 1)
@@ -210,7 +210,7 @@ def best_card(values: FloatArray, power: FloatArray, candidates: FloatArray) -> 
 
     Shapes: values (M,), power (R,), c^T Q c of the candidates (R, M).
     """
-    # A tilt that explains all but a twentieth of a pattern would turn noise into a large value.
+    # If a sound direction explains all but a twentieth of a pattern, noise would give a large value.
     power = np.where(power > 0.05 * candidates.sum(axis=1), power, np.inf)
     found = candidates @ values
     best = int((found**2 / power).argmax())
@@ -223,11 +223,11 @@ _SEARCH_S = np.arange(-8e-4, 8.01e-4, 2e-5)
 _MEMORY_S, _MIN_DELAY_S, _MIN_DRIFT_S = 30, 6, 8
 # Agreement relative to the median channel below which the delay of a channel is meaningless.
 _GOOD = 0.3
-# Share of the seconds in which a channel must be usable.
+# Share of the seconds in which a channel must be usable for a result.
 _MOSTLY = 0.7
-# Limit for the share of sound from steep directions: the own vehicle. Its near sources have delays of up to
-# 0.15 ms that no plane wave has. They are constant, so drifts can still be checked; with many channels the
-# pattern of a card is three times as long as theirs.
+# Largest share of sound from steep directions, i.e. from the own vehicle. Its near sources cause delays of up
+# to 0.15 ms that no plane wave has. These are constant, so drifts can still be checked. With many channels,
+# the pattern of a late card is three times as long.
 _NEAR = 0.5
 # With fewer free delays, any variation looks like a card.
 _MIN_FREEDOM = 3.0
@@ -248,15 +248,15 @@ _ROUNDS = 3
 
 
 class DelayCheck:
-    r"""Estimate the delay of every channel, once per second.
+    r"""Estimates the delay of every channel, once per second.
 
     Sharp beams give the direction of the sound. Each channel is then shifted until it agrees best with all
     others in these beams,
 
     .. math:: \hat\tau_m = \arg\max_\tau \sum_k \mathrm{Re}\, e^{j \omega_k \tau} \sum_d w_d\, g_{kmd}
 
-    and the part that a tilt of all waves explains is removed, because another direction of the sound also
-    causes it. The repetition with shifted channels is the self-calibration of radio astronomy.
+    and the part that another direction of the sound explains is removed. The repetition with shifted channels
+    is the self-calibration of radio astronomy.
 
     References
     ----------
@@ -591,8 +591,7 @@ class GeometryCheck:
         self._by_waves = self._order.faults() or confirmed
 
     def _most_specific(self) -> list[ChannelFault]:
-        # Microphones half a metre apart hardly predict each other, so a noisy channel must also match no
-        # wave.
+        # Microphones 0.5 m apart hardly predict each other, so a noisy channel must also match no wave.
         incoherent = self._delay.incoherent
         inverted = [one for one in self._fit.faults if one.fault is Fault.INVERTED]
         noisy = [one for one in self._fit.faults if one.fault is Fault.NOISY and incoherent[one.channel]]

@@ -32,7 +32,7 @@ from .geometry_check import PlaneWaves, diffuse_coherence
 
 # Duration of a frame, and of a part in which one source dominates: a syllable of speech.
 _FRAME_S, _PART_S = 0.032, 0.25
-# Largest number of channels for which every exchange of two is tested; one test of 56 takes half a second.
+# Most channels for which every exchange of two is tested; a single test with 56 channels takes 0.5 s.
 FEW = 16
 # Number of parts kept, those with the most coherent sound; bands times channels; fewest and most bands.
 _PARTS, _BANDS, _FEWEST, _MOST = 60, 192, 10, 24
@@ -43,7 +43,7 @@ LEAST_PARTS = 8
 # From wavelengths of eight spacings, whose phases begin to differ, to wavelengths with slight aliasing. The
 # limits in Hz also suit a smaller array, in case the positions are in inches.
 _BAND, _LEAST_TOP_HZ, _BOTTOM_HZ = (0.25, 1.5), 2000.0, (200.0, 1000.0)
-# In a band with a width of the speed of sound over this many extents of the array, phases hardly change.
+# Phases hardly change in a band with a width of the speed of sound over this many extents of the array.
 _EXTENTS = 16.0
 # Near the horizon: for a flat array, steep waves look like horizontal waves at a smaller array.
 _ELEVATIONS_RAD = np.radians([0.0, 13.0, -13.0, 26.0, -26.0])
@@ -53,10 +53,10 @@ _WAVES_RAD = np.array(np.meshgrid(_AZIMUTHS_RAD, _ELEVATIONS_RAD)).reshape(2, -1
 # Sizes within 9 % are accepted: sources above the plane of an array make it seem smaller.
 _RIGHT = (1.0, 0.92, 1.09)
 _OFF = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0, 10.0, 25.4, 39.37, 1 / 10, 1 / 25.4, 1 / 39.37)
-# Least gain of another order and of another size, in the logarithm of the unexplained part, and in standard
-# deviations. In simulated rooms, other orders than the right one lose 0.5 or more, and other sizes 0.09
-# (rings of 4) and 0.01 (56 microphones, with one direction explaining a tenth); wrong sizes gain 0.02 or
-# more.
+# Least gain of another order and of another size in the logarithm of the unexplained part, and in standard
+# deviations. In simulated rooms, right orders lose at least 0.5 by a change. Right sizes lose at least 0.09
+# (rings of 4) or 0.01 (56 microphones, of which one direction explains a tenth). Wrong sizes gain at least
+# 0.02.
 _ORDER_GAIN, SIZE_GAIN, _SIGMAS = 0.05, 0.015, 4.0
 # Mean square of the coherence below which the microphones have no common sound.
 _COHERENT = 0.02
@@ -115,7 +115,7 @@ class PositionVerdict:
     Parameters
     ----------
     order : tuple of int or None
-        Place of every channel, from 0, in an order that fits better; empty if all orders fit equally badly.
+        Place of every channel, from 0, in an order that fits better; empty if no single order fits best.
         None if the order fits or is undetermined.
     size : float or None
         Factor on the positions that fits better; None if the size fits or is undetermined.

@@ -132,6 +132,6 @@ class Resampler:
 
     def flush(self) -> Float32Array:
         """Return the outputs up to the end of the stream, as if silence followed."""
-        # Groups begin at whole inputs, so the waiting samples without half a filter determine the outputs.
+        # The waiting samples, without half a filter before them, determine the number of outputs.
         left = ceil((len(self._waiting) - (self._width - self._step) // 2) * self._ratio)
         return self.push(np.zeros((self._width, self._waiting.shape[1]), np.float32))[:left]

@@ -22,7 +22,7 @@ HOPS_A_SECOND = 10
 EDGES_HZ = (80.0, 160.0, 240.0, 340.0, 450.0, 580.0, 740.0, 940.0, 1200.0, 1500.0, 1850.0, 2250.0, 2700.0)
 _HIGH = 4  # First high band: below 450 Hz, wind and engines are modulated too
 _FRAMES, _SECOND, _MEMORY = 10, 100, 200  # Number of levels per hop, per second, and in the window
-_SHORT_S, _LONG_S = 0.032, 0.1706  # To resolve the onset of a syllable; partials of a bell 6 Hz apart
+_SHORT_S, _LONG_S = 0.032, 0.1706  # Frames that resolve syllables, and partials of a bell 6 Hz apart
 # Modulation rates, Hz: swell, beats and steps, syllables (two ranges), roughness (three ranges).
 _RATES_HZ = (0.4, 1.3, 2.8, 6.2, 10.2, 16.2, 30.2, 50.1)
 _TOGETHER_HZ = (0.4, 2.2, 8.2, 16.2, 50.1)
@@ -61,7 +61,7 @@ class SoundCharacter:
         self._frames = len(self._sound) + ends[:, None] + np.arange(-short, 0)
         self._window = np.hanning(short + 1)[:-1] / np.sqrt(short)
         self._size = fast_length(short)
-        # A mean, because at another rate the same band has three or four bins.
+        # Means, because the number of bins in a band depends on the sample rate.
         self._means = np.ascontiguousarray(_means(EDGES_HZ, np.fft.rfftfreq(self._size, 1.0 / rate)).T)
         self._lines = _Lines(long, rate)
         self._levels: FloatArray = np.zeros((_MEMORY, len(EDGES_HZ) - 1))
