@@ -67,7 +67,7 @@ def class_shares(name: str, value: object) -> ClassShares:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadUserModel:
-    """Coefficients of a softmax over kinds of road users.
+    """Softmax over kinds of road users.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def expected_labels(kinds: ClassShares) -> frozenset[str] | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DomainGuard:
-    """Coefficients of a domain guard; it holds no training data.
+    """Domain guard, a softmax over kinds of sound; it holds no training data.
 
     Parameters
     ----------

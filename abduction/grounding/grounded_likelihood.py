@@ -95,7 +95,7 @@ class Descriptor:
     name : str
         Name of the class.
     labels : tuple of str
-        Labels that a camera would report if it were visible: the expected co-evidence.
+        Labels that a camera would report for a visible road user of this class: the expected co-evidence.
     weight : float
         Prior share among all classes, > 0; shares are normalised by the model.
     speed_mean_m_s, speed_std_m_s : float

@@ -56,10 +56,10 @@ INPUTS = (
 )
 
 
-# Stored values of a hop: log ratios of left, right and visible, nats; mean log of the 60 feature values, mean
-# log energy of the bands, log of the peak-to-median ratio; 1/TTA, its deviation, bearing, left positive;
-# log energy of four groups of neighbouring bands, low ones first. Inputs hold changes of the first five and
-# maxima of the first three.
+# Stored values of a hop. `left`, `right` and `visible` are log ratios, nats; `level` is the mean log of the
+# 60 feature values, `loudness` the mean log energy of the bands, `prominence` the log of the peak-to-median
+# ratio, `rate` 1/TTA, `spread` its deviation, and `bearing` positive to the left. The bands are log energies
+# of four groups of neighbouring bands, low ones first.
 COLUMNS = (
     *("left", "right", "visible", "level", "loudness", "prominence", "rate", "spread", "bearing"),
     *_BANDS,
@@ -68,7 +68,7 @@ _OF_LEVEL = COLUMNS[COLUMNS.index("level") : -BANDS]
 _HIGHEST, _LOUDNESS, _PROMINENCE, _RATE, _SPREAD, _BEARING = map(COLUMNS.index, _OF_LEVEL)
 _CHANGING = _LOUDNESS + 1
 _BAND_COLUMNS = slice(_BEARING + 1, _BEARING + 1 + BANDS)
-# Values with a memory of eight seconds: the level, both sides and visible; the first three have a minimum.
+# Values with maxima over eight seconds: the level, both sides and visible. The first three also have minima.
 _FOLLOWED = [_LOUDNESS, *range(_HIGHEST)]
 _EACH = np.arange(len(_FOLLOWED))
 _CHANGED = [_LOUDNESS, *range(_BAND_COLUMNS.start, _BAND_COLUMNS.stop), 0, 1]

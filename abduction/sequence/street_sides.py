@@ -1,4 +1,4 @@
-r"""The arm of a known street from which a vehicle comes, from the directions in which the sound arrives.
+r"""Estimation of the arm of a known street from which a vehicle comes, from the directions of the sound.
 
 Walls may reflect the sound of one arm to the other side, so a pattern that means left at one junction can
 mean right at the next. After some passes, the patterns of both arms are known. A linear discriminant then

@@ -151,7 +151,7 @@ class Expert:
     """
 
     # `mean`, `median` or `quiet`: log-levels minus that summary of the site; `shape`: the values of
-    # `shape_features` for the window; `shape_change`: their difference to those of the site's median.
+    # `shape_features` for the window; `shape_change`: their difference from those of the site's median.
     view: str
     mean: FloatArray  # shape (inputs,): Standardisation; scale > 0
     scale: FloatArray

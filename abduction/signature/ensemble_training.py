@@ -21,8 +21,8 @@ from .window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT, WINDOW_CLASSES, m
 # most 0.002 and the share of right sides by at most 0.03. The side is right in 93 % of the windows; in 85 %
 # without such a part and in 84 % with a part of 0.5.
 SIMULATED_WEIGHT, OTHER_SIDE = 1.0, 0.25
-# Part of a real window's weight that is used with the site estimate before that window. A larger part reduces
-# the AUROC at the worst junction by 0.01 for a standing ego; without it, a moving ego loses 0.01.
+# Part of a real window's weight that is used with the site estimate before that window. A larger part costs a
+# standing ego 0.01 of the AUROC at the worst junction, and no such part costs a moving ego 0.01.
 HEARD_PART = 0.25
 # Site name of sounds without a street; training uses them whatever sites are left out.
 OPEN_FIELD = "open field"

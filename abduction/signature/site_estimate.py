@@ -33,7 +33,7 @@ from worldstate.ground.serialisation import Check
 from .ensemble import KINDS, EnsembleModel, log_levels
 from .window_classes import window_evidence
 
-# Share of the difference in level that the reference receives; it receives all of the pattern.
+# Share of the level difference that enters the reference; the pattern enters completely.
 _LEVEL_GAIN = 0.25
 
 

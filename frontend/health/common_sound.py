@@ -54,8 +54,9 @@ _COVERED_HOPS = 3
 # Misfit of a second: at most 0.32 in clean streets of both renderers with 11 arrays of 4 to 56; mostly 0.7 to
 # 1.3 for channels in random orders; 0.7 to 1 during seven seconds of a siren with equally long echoes.
 _MISFIT = 0.4
-# Change of the agreement per second, and its range. In a right order, a siren makes the agreement negative
-# only if it lasts twice as long as the fitting sound before. Three fitting seconds make it positive again.
+# Change of the agreement per second, and its range. In the right order, a siren makes the agreement negative
+# only if it lasts twice as long as the sound that fitted before; three fitting seconds make it positive
+# again.
 _VOTES, _AGREEMENT = (-0.5, 1.0), (-3.0, 20.0)
 _EVERY_HOPS = 10
 
@@ -203,7 +204,7 @@ class FarField:
 
 
 def _in_any_order(weights: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return the mean of weights (KP, KP) over all orders of the microphones; `ends` are those of pairs, (P, M)."""
+    """Return the mean of weights (KP, KP) over all microphone orders; `ends` are those of pairs, (P, M)."""
     # The mean depends only on the number of microphones that two pairs share, and on the sign.
     shared, one = ends @ ends.T, np.eye(len(ends))
     groups = [one, shared - 2.0 * one] + ([(shared == 0.0).astype(float)] if (ends >= 0.0).all() else [])

@@ -185,13 +185,13 @@ class PositionCheck:
         return sorted(self._parts, key=lambda one: -one[0])[:_PARTS]
 
     def heard(self) -> Complex64Array:
-        """Return the coherence (S, K, M, M) of the parts with the most common sound."""
+        """Return the coherence (S, K, M, M) of the most coherent parts."""
         kept = [coherence for power, coherence in self._strongest() if power > _COHERENT]
         shape = len(self._frequencies), len(self.positions_m), len(self.positions_m)
         return np.asarray(kept, np.complex64).reshape(-1, *shape)
 
     def comparison(self, usable: BoolArray, heard: Complex64Array) -> "Comparison":
-        """Return the comparison of hypotheses for the usable channels (M,), from parts of `heard`."""
+        """Return a comparison of hypotheses for the usable channels (M,), from coherence as in `heard`."""
         return Comparison(self.positions_m, self._frequencies, np.flatnonzero(usable), heard, self._noise)
 
     def verdict(self, usable: BoolArray, heard_from_rad: float | None = None) -> PositionVerdict:
