@@ -20,8 +20,8 @@ HOP_RATE_HZ, WINDOW_HOPS = 10.0, 10
 BEARING_HOPS = 2
 # The horizon, and the street from 5 to 20 m ahead of a roof: tyres at 8 m are 10 degrees below the horizon.
 # With a search at the horizon only, an array with rows at several heights interprets the path difference as
-# another azimuth: the median error for simulated visible vehicles is 5 degrees with 56 microphones and 50
-# with 4; with both elevations it is 3 and 1 degrees.
+# another azimuth. The median error for simulated visible vehicles is then 5 degrees with 56 microphones and
+# 50 with 4; with both elevations it is 3 and 1.
 ELEVATIONS_RAD = np.radians([-12.0, 0.0])
 # Band of the paper, for microphones 8.8 cm apart.
 BAND_HZ = (300.0, 1800.0)

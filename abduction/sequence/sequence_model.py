@@ -289,7 +289,7 @@ class AlarmCurve:
         Raises
         ------
         InvalidArgumentError
-            If the budget has fewer than the least onsets in the hours of the curve, or is above the curve.
+            If the hours of the curve are too few for this budget (`least_onsets`), or it exceeds the curve.
         """
         least = self.least_onsets / self.hours
         self._check("budget", onsets_per_hour, self.onsets_per_hour, least, "onsets per hour")
@@ -306,7 +306,7 @@ class AlarmCurve:
         Raises
         ------
         InvalidArgumentError
-            If the curve has fewer than the least onsets at that share, or the share is above the curve.
+            If the hours of the curve are too few for this share (`least_onsets`), or it exceeds the curve.
         """
         too_few = (1.0 - 2.0 * TINY) * self.least_onsets / self.hours
         known = self.alpha[_last(self.onsets_per_hour, too_few) + 1 :]

@@ -226,7 +226,7 @@ class StreetListener:
         left, right = [min(one + 1, HEARD_HOPS) for one in before.since]
         recent = np.concatenate([before.recent[1 - HEARD_HOPS :], now])
         self.hearing = StreetHearing(before.known, recent, (left, right))
-        # The sound of a vehicle that has come into view belongs to no arm for this time.
+        # During this time, the sound of a vehicle that has come into view belongs to no arm.
         if self._sides is None or min(left, right) < HEARD_HOPS:
             return groups
         return np.asarray(self._sides.turned(groups[None], feature[None])[0])

@@ -85,7 +85,7 @@ class SiteEnsembleClassifier:
     recipes : sequence of Recipe
         One recipe per expert.
     simulated : SimulatedWindows, optional
-        Further training windows, used for the sites of the training set.
+        Additional training windows; those of sites in the training set are used.
 
     Attributes
     ----------

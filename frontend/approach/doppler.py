@@ -130,7 +130,7 @@ _LEAST_GAIN = 10.0
 # Limits for the slope of the line's level over -20 log10 of the fitted range (1 in the free field), and their
 # least correlation. The level of a slowing engine at the kerb remains constant.
 _LEVEL_GAINS, _LEAST_CORRELATION = (0.4, 2.5), 0.8
-_MOST_STD_M_S = 1.0  # Median standard deviation of the radial speed over the track
+_MOST_STD_M_S = 1.0  # Largest median standard deviation of the radial speed over the track
 
 
 @dataclass(frozen=True, slots=True)

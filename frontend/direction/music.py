@@ -118,7 +118,7 @@ def _checked_spectra(spectra: ArrayLike) -> ComplexArray:
 def count_sources(eigenvalues: ArrayLike, frames: int) -> int:
     r"""Estimate the number of sources from the eigenvalues of one or more bins.
 
-    All criteria assume noise that is white across the microphones and independent frames. In a real street,
+    All criteria assume independent frames and noise that is white across the microphones. In a real street,
     reflections are coherent with their source, wind and ego-noise are not white, and overlapping frames are
     not independent. The result is therefore the number of plane waves that the noise model does not explain,
     not the number of vehicles.

@@ -38,7 +38,7 @@ FEW = 16
 _PARTS, _BANDS, _FEWEST, _MOST = 60, 192, 10, 24
 # Number of tested delays between two channels: at 16 kHz and 10 cm about a third of a sample apart.
 _DELAYS = 201
-# Two seconds: in less, a single word would determine the result.
+# At least two seconds, so that a single word does not determine the result.
 LEAST_PARTS = 8
 # From wavelengths of eight spacings, whose phases begin to differ, to wavelengths with slight aliasing. The
 # limits in Hz also suit a smaller array, in case the positions are in inches.
