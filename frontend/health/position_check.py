@@ -267,7 +267,7 @@ class Comparison:
 
     @property
     def _is_one_wave(self) -> bool:
-        """Whether a vertical array receives one wave; another size then only means another angle."""
+        """Whether an array in a vertical plane receives one wave, for which size and angle are equivalent."""
         extent_m = float(np.abs(self._positions).max())
         if np.linalg.matrix_rank(self._positions[:, :2], tol=_SAME_PLACE * extent_m) > 1:
             return False
