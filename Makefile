@@ -62,7 +62,7 @@ lint: $(VENV)/.test
 schema: $(VENV)/.core
 	$(BIN)/python docs/_ext/json_schema.py
 
-# After `worldstate-lab ... --results docs/evidence/results.json`: the figures of the pages.
+# After a change of a template in docs/templates, or `worldstate-lab ... --results docs/evidence/results.json`.
 figures:
 	$(PYTHON) docs/_ext/figures.py
 

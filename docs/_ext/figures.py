@@ -1,8 +1,10 @@
-"""Figures of the pages, each taken by name from what the laboratory wrote: `make figures`.
+"""Write the pages that contain figures from their templates: `make figures`.
 
-`docs/evidence/results.json` holds what `worldstate-lab ... --results` kept, `docs/evidence/figures.csv` gives
-a figure a name: the key of its command, where it stands in the report, and how it is written. On a page a
-name in a comment follows the figure: ``.983 <!-- standing.auroc -->``. Two pages cannot differ.
+`worldstate-lab ... --results docs/evidence/results.json` stores the figures of a command.
+`docs/evidence/figures.csv` gives a figure its name: the key of the command, the path in its report, the ends
+of the interval and the number of decimals. The template `docs/templates/evidence/place.md.in` becomes the
+page `docs/evidence/place.md`: ``{{ standing.auroc }}`` becomes ``0.972 [0.957, 0.985]``, and
+``{{ standing.detected % }}`` becomes ``69 % [66, 73]``.
 """
 
 import csv
@@ -14,31 +16,30 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parents[1]
 EVIDENCE = DOCS / "evidence"
-# A figure, perhaps with its interval, and its name.
-_NAMED = re.compile(r"[-\d.]+(?: \[[^\]]*\])? <!-- ([\w.]+) -->")
+TEMPLATES = DOCS / "templates"
+FIGURE = re.compile(r"\{\{ ([\w.]+)( %)? \}\}")
 
 
 def rows() -> list[dict[str, str]]:
-    """Return the lines of the table of names."""
+    """Return the rows of the table of names."""
     with (EVIDENCE / "figures.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
-def written(row: dict[str, str], results: dict[str, Any]) -> str:
-    """Return a figure as a page shows it: without the zero before its point, its interval behind it."""
+def written(row: dict[str, str], results: dict[str, Any], percent: bool = False) -> str:
+    """Return a figure with its interval as a page prints it, perhaps in per cent."""
     found = results[row["key"]]["figures"]
     ends = (row["at"], *filter(None, (row["low"], row["high"])))
-    values = [reduce(_inside, path.split("/"), found) for path in ends]
-    figure, *interval = (_plain(float(value), int(row["digits"])) for value in values)
-    return f"{figure} [{', '.join(interval)}]" if interval else figure
+    values = [float(reduce(_inside, path.split("/"), found)) for path in ends]
+    digits, factor, unit = int(row["digits"]), 1, ""
+    if percent:
+        digits, factor, unit = max(digits - 2, 0), 100, " %"
+    figure, *interval = (f"{factor * value:.{digits}f}" for value in values)
+    return f"{figure}{unit} [{', '.join(interval)}]" if interval else figure + unit
 
 
 def _inside(held: Any, name: str) -> Any:
     return held[int(name)] if isinstance(held, list) else held[name]
-
-
-def _plain(value: float, digits: int) -> str:
-    return re.sub(r"^(-?)0\.", r"\1.", f"{value:.{digits}f}")
 
 
 def page_of_results(results: dict[str, Any]) -> str:
@@ -58,14 +59,16 @@ def page_of_results(results: dict[str, Any]) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """Return the text of every page with figures, as the results say it."""
+    """Return the text of every page that contains figures."""
     results = json.loads((EVIDENCE / "results.json").read_text(encoding="utf-8"))
-    figures = {row["name"]: written(row, results) for row in rows()}
+    named = {row["name"]: row for row in rows()}
     texts = {EVIDENCE / "results.md": page_of_results(results)}
-    for page in (DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))):
-        text = page.read_text(encoding="utf-8")
-        if _NAMED.search(text):
-            texts[page] = _NAMED.sub(lambda at: f"{figures[at[1]]} <!-- {at[1]} -->", text)
+    for template in sorted(TEMPLATES.rglob("*.md.in")):
+        page = template.relative_to(TEMPLATES).with_suffix("")
+        text = template.read_text(encoding="utf-8")
+        texts[(DOCS.parent if page.name == "README.md" else DOCS) / page] = FIGURE.sub(
+            lambda at: written(named[at[1]], results, bool(at[2])), text
+        )
     return texts
 
 

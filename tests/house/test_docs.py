@@ -14,6 +14,7 @@ from worldstate.cli.main import PROGRAM, current_words
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "docs" / "_ext"))
+import figures  # noqa: E402
 import reference  # noqa: E402
 
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md"))]
@@ -108,14 +109,15 @@ def test_files_that_a_page_names_exist(page):
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
-def test_figures_are_those_that_the_laboratory_wrote():
-    import figures
-
+def test_pages_are_those_that_make_figures_writes():
     texts = figures.pages()
     assert [path.name for path, text in texts.items() if path.read_text("utf-8") != text] == []
-    # A figure without its number would not be found.
-    readme = texts[ROOT / "README.md"]
-    assert len(re.findall(r"[\d\]] <!-- [\w.]+ -->", readme)) == readme.count("<!--") >= 10
+    assert [page.name for page in PAGES if re.search(r"<!--|\{\{", page.read_text("utf-8"))] == []
+
+
+def test_figures_of_the_readme_are_taken_by_name():
+    template = (figures.TEMPLATES / "README.md.in").read_text(encoding="utf-8")
+    assert len(figures.FIGURE.findall(template)) >= 10
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
