@@ -1,1 +1,1 @@
-"""The filter: predict and update of the whole world-state, its memory and its snapshots."""
+"""The world-state filter: predict, update, memory and snapshots."""

@@ -20,8 +20,8 @@ from worldstate.measurement.measurement import Bearing, Measurement
 from .birth_death import HIDDEN
 from .memory import Memory
 
-# Density of peaks that are not this entity's: uniform over the half-plane ahead, since images in walls and
-# other sources were found at all azimuths.
+# Density of peaks of other sources: uniform over the half-plane ahead, because images in walls and other
+# sources were found at all azimuths.
 _LOG_CLUTTER_DENSITY = -math.log(math.pi)
 _ANYWHERE_RAD2 = math.pi**2 / 12.0
 
@@ -29,11 +29,10 @@ _ANYWHERE_RAD2 = math.pi**2 / 12.0
 def acoustic_update(memory: Memory, measurement: Measurement, weight: float, site: SiteGeometry) -> None:
     """Update the entities with the bearing and the approach rate of a measurement.
 
-    R is divided by `weight`: consecutive windows overlap, and full weight for each would count the same
-    samples up to ten times.
+    R is divided by `weight`: windows overlap, and full weight would use the same samples up to ten times.
     """
     tracks, bearing, approach, street = memory.tracks, measurement.bearing, measurement.approach, site.street
-    # A measured position tells more than a bearing that may be that of a wall.
+    # A measured position is more accurate than a bearing, which may point to a reflecting wall.
     rows = (tracks.moving & ~tracks.placed).nonzero()[0]
     silent = isinstance(bearing, NotUsable) and isinstance(approach, NotUsable)
     if weight <= 0.0 or silent or not len(rows):
@@ -81,12 +80,12 @@ def association_probability(
 def _path_in_view(bearing: Bearing, site: SiteGeometry) -> tuple[tuple[float], tuple[float]]:
     r"""Return standard deviation and prior path probability of a peak of an entity in line of sight.
 
-    The deviation that comes with a peak holds that it may be another one, which association weighs itself:
+    The deviation of a measured peak includes the chance p that the peak belongs to another source:
 
     .. math:: \sigma^2 = \sigma_0^2 + p\, \frac{\pi^2}{12}
 
-    with the deviation :math:`\sigma_0` of peaks that are the entity's, and p the chance that this one is not.
-    Nor is it past an edge, where nothing is in view: there it is an image, or that of a hidden vehicle.
+    Association treats p separately, so only the entity's own deviation :math:`\sigma_0` is returned. A peak
+    past an edge is an image or belongs to a hidden vehicle.
     """
     street, azimuth_rad = site.street, np.array([bearing.azimuth_rad])
     own_rad = min(bearing.std_rad, street.seen_std_rad)

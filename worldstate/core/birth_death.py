@@ -1,4 +1,4 @@
-"""Births, hand-overs and deaths of entities, those that have become one, and the events of all this."""
+"""Births, hand-overs, merges and deaths of entities, and the events that report them."""
 
 from collections.abc import Mapping, Sequence, Set
 
@@ -16,13 +16,13 @@ from worldstate.state.entity import EventKind
 
 from .memory import MOST_BOXES, Memory
 
-HIDDEN = 0.5  # P(hidden | exists) from which on an entity is said to be
+HIDDEN = 0.5  # P(hidden | exists) from which an entity is published as hidden
 
 
 def birth_death(
     memory: Memory, alarmed: Sequence[bool], measurement: Measurement, site: SiteGeometry
 ) -> None:
-    """Let entities that are only heard be born or end.
+    """Create and remove sound-only entities.
 
     Shapes: alarmed (K,).
     """
@@ -33,7 +33,7 @@ def birth_death(
     side = _side_of_birth(memory, alarmed, site) if measurement.heard.usable else None
     if side is not None:
         one = born_hidden(memory, side, 0.0, measurement.stamp_ns, measurement.source, site)
-        # A detector adds to the kinds at the hand-over.
+        # At the hand-over a detector refines the classes.
         labels, motion = measurement.kinds or one.labels, site.sides[side].prior()
         memory.tracks = memory.tracks.joined([replaced(one, labels=labels, motion=motion)])
     view_heard(memory, site)
@@ -42,17 +42,17 @@ def birth_death(
 def born_hidden(
     memory: Memory, side: int, existence: float, stamp_ns: int, source: str, site: SiteGeometry
 ) -> Track:
-    """Return one more hidden entity of a side."""
+    """Return a new hidden entity on a side."""
     one = born(site.sides[side].label, memory.history[side].births, existence, stamp_ns, site)
     memory.history[side].births += 1
     return replaced(one, side=side, came_from=1.0, sources=(source,))
 
 
 def view_heard(memory: Memory, site: SiteGeometry) -> None:
-    """Give the entities that are only heard what the belief of the sides has of them.
+    """Set the sound-only entities from the belief over the sides.
 
-    Their existence, their chance to be hidden, their side and azimuth are marginals; their own are an
-    identity, classes and the approach rate. One alone may be on any side, two are on one each.
+    Existence, P(hidden), side and azimuth are marginals of the belief. The entity itself keeps only its
+    identity, classes and approach rate. A single entity may be on any side; two are on one side each.
     """
     tracks, belief, rows = memory.tracks, memory.belief, _heard_rows(memory.tracks)
     if not rows:
@@ -61,7 +61,7 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
     for i in rows:
         shares = sides.side_shares(site.street.death) if len(rows) == 1 else ()
         is_open = sum([share > 0.0 for share in shares]) > 1
-        # In a tie it stays, which rounding must not undo.
+        # In a tie the side is kept; the tolerance prevents a change by rounding.
         if shares and shares[tracks.side[i]] < max(shares) * (1.0 - TINY):
             tracks.side[i] = shares.index(max(shares))
             if tracks.behind[i] >= HIDDEN:
@@ -79,7 +79,7 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
 
 
 def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
-    """Return the belief of the sides without a vehicle that has just come into view: it has a track."""
+    """Return the belief over the sides without vehicles that have just come into view and have tracks."""
     sides, found = memory.sides, memory.belief.emerged_since(memory.stamp_ns, site.street.beside_s)
     emerged = tuple([0.0 if own else one for own, one in zip(found, sides.emerged, strict=True)])
     return replaced(sides, emerged=emerged)
@@ -99,7 +99,7 @@ def hidden_rows(tracks: Tracks) -> list[int]:
 
 
 def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry) -> bool:
-    """Tell whether an entity that is only heard is believed no more."""
+    """Return whether a sound-only entity has become too unlikely."""
     least, of_side = site.street.death, int(memory.tracks.side[row])
     several = len(_heard_rows(memory.tracks)) > 1
     existence = _unseen(memory, site).existence(of_side if several else None)
@@ -107,17 +107,17 @@ def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry)
 
 
 def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> int | None:
-    """Return the side on which a hidden entity is born, if one is: of one vehicle the likelier one."""
+    """Return the side on which a hidden entity is born, or None; a single vehicle gets the likelier side."""
     tracks, sides, least, every = memory.tracks, memory.sides, site.street.birth, range(len(site.sides))
     heard = _heard_rows(tracks)
-    # The window still holds the sound from before one came into view.
+    # After a vehicle has come into view, the window still contains its earlier sound.
     masked = memory.belief.emerged_since(memory.stamp_ns, site.street.masked_s)
     taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
     if heard and (len(heard) > 1 or sides.both < least):
         return None
     if not taken and not any(masked) and (sides.hidden_on(None) >= least or any(alarmed)):
         return max(every, key=sides.hidden_on)
-    # In view by its sound, while no sensor looks.
+    # If no sensor looks, a vehicle may be in view by its sound alone.
     if not heard and not any(masked) and max(memory.belief.shown) >= least:
         return max(every, key=memory.belief.shown.__getitem__)
     free = [k for k in every if not masked[k] and k not in taken and (sides.hidden[k] >= least or alarmed[k])]
@@ -125,10 +125,10 @@ def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) 
 
 
 def merge_tracks(memory: Memory, site: SiteGeometry) -> tuple[Event, ...]:
-    """Merge two that are only heard if it is unlikely that there are two; return which id has ended."""
+    """Merge two sound-only entities if two vehicles are unlikely; return the events."""
     tracks, heard = memory.tracks, _heard_rows(memory.tracks)
     least = site.street.birth * min((tracks.existence[i] for i in heard), default=0.0)
-    # Beside the less likely one the other one would not be born.
+    # Given the less likely one, the other one is too unlikely to be born.
     if len(heard) < 2 or memory.sides.both >= least:
         return ()
     age = [(-tracks.existence[i], tracks.created_ns[i], tracks.id[i]) for i in heard]
@@ -139,7 +139,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> tuple[Event, ...]:
 
 
 def hidden_on(tracks: Tracks, k: int) -> int | None:
-    """Return the row of the likeliest hidden entity of a side, or of one that may be there, if any is."""
+    """Return the row of the likeliest hidden entity that is, or may be, on a side; None if there is none."""
     there = [
         i
         for i in hidden_rows(tracks)
@@ -148,19 +148,19 @@ def hidden_on(tracks: Tracks, k: int) -> int | None:
     return max(there, key=lambda i: (tracks.side[i] == k, tracks.existence[i]), default=None)
 
 
-# Of one step. The deaths and births of a whole street are fewer; a snapshot stays of bounded size.
+# Per step, to limit the size of a snapshot; a whole street has fewer deaths and births.
 MOST_EVENTS = MOST_BOXES
 
 
 def published(tracks: Tracks, street: StreetModel) -> Tracks:
-    """Return the tracks that a snapshot names."""
-    # A refuted claim is remembered while it is repeated: forgotten, it would be believed anew.
+    """Return the tracks that a snapshot lists."""
+    # A refuted claim is kept while it is repeated; otherwise its next repetition would be believed again.
     refuted = tracks.placed & (tracks.existence < street.death)
     return tracks.taken(~refuted) if True in refuted else tracks
 
 
 def events_between(before: Tracks, after: Tracks, steps: Sequence[Memory]) -> tuple[Event, ...]:
-    """Return what became of every entity, those that were there before first; `steps` hold their merges."""
+    """Return the events of all entities, old ones first; `steps` contain the merges."""
     stamp_ns = steps[-1].stamp_ns
     into = {one.entity_id: one.into for step in steps for one in step.last.events if one.into}
     was_in_view, in_view = ((one.seen & (one.behind < HIDDEN)).tolist() for one in (before, after))
@@ -184,15 +184,16 @@ def events_between(before: Tracks, after: Tracks, steps: Sequence[Memory]) -> tu
 def after_look(
     memory: Memory, emerged: Mapping[int, float], known: int, stamp_ns: int, site: SiteGeometry
 ) -> None:
-    """Update the memory after a look; entities beyond the first so many, which were known, are new.
+    """Update the memory after a look; entities from row `known` on are new.
 
-    `emerged` is the chance that a detection was theirs, by the rows of those that were not seen before.
+    `emerged` maps rows that come into view to the chance that the detection belongs to them.
     """
     tracks, sides, least = memory.tracks, memory.tracks.side.tolist(), site.street.unheard
-    # Of the side where it is: what was heard may have been believed on the other one. Of two the likelier.
+    # The detection determines the side, since the belief may have been on another one. Of two, the likelier
+    # one.
     residuals = [(max(least, 1.0 - chance), sides[i]) for i, chance in emerged.items()]
     handed_over = {side: residual for residual, side in sorted(residuals, reverse=True)}
-    # First seen near an edge that hides vehicles, it came past it unheard.
+    # A moving vehicle that is first seen near an edge came past this edge unnoticed.
     unheard = set[int]()
     for i in range(known, len(tracks)):
         side = site.sides[sides[i]]
@@ -206,25 +207,25 @@ def after_look(
 def past_edges(
     memory: Memory, handed_over: Mapping[int, float], unheard: Set[int], stamp_ns: int, street: StreetModel
 ) -> None:
-    """Update the memory after vehicles came past the edges of some sides: the one place that tells of it.
+    """Update the memory after vehicles came past the edges of some sides.
 
-    `handed_over` is P(it was another vehicle than the one believed hidden there), by side; `unheard` are
-    sides from which one came that was not believed.
+    `handed_over` is P(it was another vehicle than the one believed hidden there), by side. `unheard` contains
+    the sides from which an unexpected vehicle came.
     """
     if not handed_over and not unheard:
         return
     tracks, hidden = memory.tracks, ~memory.tracks.seen
-    # One that is still believed hidden where another came from was not what came.
+    # If an entity is still believed hidden on the side, another vehicle came.
     came = {k: float(k in tracks.side[hidden]) for k in unheard} | dict(handed_over)
-    # Told apart from others: by a message, or since they were seen.
+    # Entities that are distinct from others: announced by a message, or seen before.
     apart = hidden & (tracks.detected | (tracks.last_seen_ns != NEVER_NS))
     memory.belief = memory.belief.handed_over(came, set(tracks.side[apart].tolist()), stamp_ns, street)
 
 
 def surviving(tracks: Tracks, street: StreetModel) -> Tracks:
-    """Return the tracks without seen entities of too little existence or too uncertain azimuth.
+    """Return the tracks without seen entities of low existence or uncertain azimuth.
 
-    What a camera would mostly miss is not lost for being missed: its existence says how long it is believed.
+    An entity that a camera would mostly miss is kept for as long as its existence is high enough.
     """
     known = tracks.covariance[:, AZIMUTH, AZIMUTH] <= (2.0 * street.past_std_rad) ** 2
     known |= tracks.miss_rate > MOSTLY_MISSED

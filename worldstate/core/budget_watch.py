@@ -1,13 +1,13 @@
-r"""The budget of onsets and the chances stated, held against what a camera sees later: testing by betting.
+r"""Tests by betting: alarm budget and published chances against the later detections of a camera.
 
-Each test carries e-values, ratios of an alternative's likelihood to the greatest that the claim allows, whose
-mean is at most one while the claim holds. They begin anew at a rate :math:`\eta` of time watched,
+Each test has e-values: ratios of an alternative's likelihood to the greatest likelihood that the claim
+allows. While the claim holds, their mean is at most one. They restart at a rate :math:`\eta` of the observed
+time,
 
 .. math:: M \leftarrow (1 - \eta\, dt)\, M\, e + \eta\, dt,
 
-so that what was right for hours does not outweigh what is wrong now. M less :math:`\eta t` is a
-supermartingale, and its mean at most one: in any time T, P(M reaches b) is at most
-:math:`(1 + \eta T) / b` (Ville).
+so that hours of correct values do not hide a new error. M less :math:`\eta t` is a supermartingale with a
+mean of at most one: in any time T, P(M reaches b) is at most :math:`(1 + \eta T) / b` (Ville).
 
 Sources: Shafer, "Testing by betting", J. R. Statist. Soc. A 184, 2021; Shin, Ramdas, Rinaldo, "E-detectors",
 2022.
@@ -23,33 +23,34 @@ from worldstate.ground import TINY, InvalidArgumentError, nanoseconds, seconds
 from worldstate.ground.values import SECONDS_PER_HOUR, replaced
 from worldstate.state.cue import Budget, Tally, Verdict
 
-# Whatever is advised of comes into view within the risk's own horizon, or was not there. So long after one
-# came, sound is that of a vehicle that has been seen: no onset of a street without hazards.
+# A vehicle that does not come into view within the risk's horizon was a false alarm. For the same time after
+# a vehicle has come into view, the sound may be its own, so an onset is ignored.
 HORIZON_NS = nanoseconds(COMING_S[-1])
-BET_NS, BET_S = nanoseconds(2.0), 2.0  # A chance of two seconds is known after two
-LOOK_NS = nanoseconds(0.5)  # A look tells of its own time, so longer steps were not watched
-SLACK_NS = nanoseconds(0.05 * HOP_S)  # For the rounding of stamps
-# An alarm is held for a second: later it is another onset.
+BET_NS, BET_S = nanoseconds(2.0), 2.0  # The outcome of a two-second chance is known after two seconds
+LOOK_NS = nanoseconds(0.5)  # Longest gap between the looks of an unbroken watch
+SLACK_NS = nanoseconds(0.05 * HOP_S)  # Tolerance for rounded stamps
+# An alarm is held for a second; an alarm after that is a new onset.
 ENDS_NS = nanoseconds(HELD_HOPS * HOP_S) + SLACK_NS
 _BEGUN_ANEW_HZ = 1.0 / (6.0 * SECONDS_PER_HOUR)
-# By (1 + eta T) / b a probability of 0.05 in 24 hours, half for each test.
+# By (1 + eta T) / b, a test reaches this with a probability of at most 0.025 in 24 hours.
 BROKEN = 200.0
 IN_DOUBT = 0.1 * BROKEN
-# Onsets come in clusters of up to so many; the root of a Poisson ratio of that order still has a mean of at
-# most one for clusters that come at random.
+# Onsets come in clusters of up to this size. With a root of this order, the mean of a Poisson ratio is still
+# at most one for clusters at random times.
 CLUSTER = 2.0
-RATES = (2.0, 10.0)  # Alternatives, in budgets: what is to be found within two hours, and within minutes
-# A chance is held where the share that comes has log-odds within so much of its own; bets are at twice it.
-# Streets differ by a factor of three either way, 1.1 nats; what is learned of their traffic takes .5.
+RATES = (2.0, 10.0)  # Alternatives in budgets: detectable within two hours, and within minutes
+# A chance is accepted if the log-odds of the observed share differ from its own by less than this; the
+# alternatives differ by twice as much. Streets differ by a factor of three either way (1.1 nats); the filter
+# learns 0.5 nats of this from the traffic.
 TOLERANCE_NATS = 0.7
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """E-values of a claim, one an alternative, and whether they have broken it.
+    """E-values against a claim, one per alternative, and whether they have rejected the claim.
 
-    Once broken it is until they say no more than before the first bet; what exceeds the bar is not kept, so
-    that the way back is short.
+    A rejected claim stays rejected until the mean falls to one, the value before the first bet. The mean is
+    capped at `BROKEN`, so that recovery is quick.
     """
 
     values: tuple[float, ...]
@@ -61,7 +62,7 @@ class Evidence:
         return math.fsum(self.values) / len(self.values)
 
     def after(self, factors: Sequence[float], step_s: float) -> "Evidence":
-        """Return the evidence after a time watched, and what it brought for each alternative."""
+        """Return the evidence after more observed time, with one factor per alternative."""
         anew = -math.expm1(-_BEGUN_ANEW_HZ * step_s)
         values = [(1.0 - anew) * one * e + anew for one, e in zip(self.values, factors, strict=True)]
         mean = math.fsum(values) / len(values)
@@ -70,24 +71,24 @@ class Evidence:
 
 
 def onset_factors(onsets: int, step_s: float, onsets_per_hour: float) -> list[float]:
-    r"""Return what so many false onsets in a time bring against "no more an hour than the budget b".
+    r"""Return the e-value factors of some false onsets against the claim "at most b onsets per hour".
 
     .. math:: e_\rho = \big(\rho^n\, e^{-(\rho - 1)\, b\, dt}\big)^{1/c}
 
-    of clusters of at most c onsets: at most one in the mean, at any rate up to b.
+    For clusters of at most c onsets the mean is at most one at any rate up to b.
     """
     allowed = onsets_per_hour * step_s / SECONDS_PER_HOUR
     return [math.exp((onsets * math.log(rho) - (rho - 1.0) * allowed) / CLUSTER) for rho in RATES]
 
 
 def chance_factors(chances: Sequence[float], came: Sequence[bool]) -> list[float]:
-    r"""Return what the outcomes of some chances bring against them: one for too low, one for too high.
+    r"""Return the e-value factors of some outcomes against "not too low" and "not too high" chances.
 
     .. math:: e_\pm = \frac{1}{n} \sum_k \frac{P(y_k \mid p_k^{\pm 2\delta})}{P(y_k \mid p_k^{\pm\delta})},
               \qquad \mathrm{logit}\, p^{d} = \mathrm{logit}\, p + d
 
-    with the tolerance :math:`\delta`: at most one in the mean, wherever the share that comes is within it.
-    Sides may depend on one another, so their factors are averaged, not multiplied.
+    With the tolerance :math:`\delta` the mean is at most one if the true share is within it. Sides may depend
+    on one another, so their factors are averaged, not multiplied.
     """
     pairs = list(zip(chances, came, strict=True))
     return [
@@ -97,7 +98,7 @@ def chance_factors(chances: Sequence[float], came: Sequence[bool]) -> list[float
 
 
 def _moved(chance: float, nats: float, came: bool) -> float:
-    """Return the probability of an outcome after its chance has moved by some log-odds."""
+    """Return the probability of an outcome after a shift of its log-odds."""
     inside = min(max(chance, TINY), 1.0 - TINY)
     up = inside * math.exp(nats)
     return (up if came else 1.0 - inside) / (up + 1.0 - inside)
@@ -105,39 +106,39 @@ def _moved(chance: float, nats: float, came: bool) -> float:
 
 @dataclass(frozen=True, slots=True)
 class WatchedHop:
-    """What a hop says to the watch; of each side, left and right."""
+    """Input of the watch at one hop, with one value per side."""
 
     stamp_ns: int
-    looked: bool  # Whether a camera would have seen what comes into view
+    looked: bool  # Whether a camera would have seen a vehicle that comes into view
     over: Sequence[bool]  # Whether the threshold is reached
-    emerged_ns: tuple[int | None, ...]  # When one last came into view
-    within: tuple[float, ...]  # Chance that one does within two seconds
+    emerged_ns: tuple[int | None, ...]  # When a vehicle last came into view
+    within: tuple[float, ...]  # P(a vehicle comes into view within two seconds)
 
 
 _NO_ONSETS, _NO_CHANCES = Evidence((1.0,) * len(RATES)), Evidence((1.0, 1.0))
-_MOST = len(RATES) * BROKEN * (1.0 + TINY)  # All of the mean in one of them
+_MOST = len(RATES) * BROKEN * (1.0 + TINY)  # Limit of one e-value: the whole mean
 
 
 @dataclass(frozen=True, slots=True)
 class BudgetWatch:
-    """The watch over an alarm: it reports, and moves no threshold."""
+    """Watch over an alarm, which reports but changes no threshold."""
 
     tally: Tally = field(default_factory=Tally)
     onsets: Evidence = _NO_ONSETS
     within: Evidence = _NO_CHANCES
     stamp_ns: int = 0
-    since_ns: int | None = None  # Since when a camera has looked without a break
-    pending_ns: tuple[int, ...] = ()  # Onsets of which it is not known yet whether anything comes
+    since_ns: int | None = None  # Start of the present unbroken series of looks
+    pending_ns: tuple[int, ...] = ()  # Onsets whose outcome is still open
     over_ns: tuple[int | None, ...] = (None, None)  # When each side was last above the threshold
     emerged_ns: tuple[int | None, ...] = (None, None)
-    bet: tuple[int, tuple[float, ...]] | None = None  # Chances stated then, of which the outcome is awaited
+    bet: tuple[int, tuple[float, ...]] | None = None  # Stamp and chances of the open bet
 
     def watches(self, stamp_ns: int) -> bool:
-        """Tell whether a camera has looked until just now."""
+        """Return whether a camera has looked without a break until now."""
         return self.since_ns is not None and stamp_ns - self.stamp_ns <= LOOK_NS
 
     def after(self, hop: WatchedHop, onsets_per_hour: float) -> "BudgetWatch":
-        """Return the watch one hop on."""
+        """Return the watch after one more hop."""
         now_ns, watch = hop.stamp_ns, self
         if not (hop.looked and self.watches(now_ns)):
             since_ns = now_ns if hop.looked else None
@@ -152,7 +153,7 @@ class BudgetWatch:
         )
 
     def _counted(self, hop: WatchedHop, onsets_per_hour: float) -> "BudgetWatch":
-        """Return the watch after the vehicles that have come, and time of which it is known that none did."""
+        """Return the watch with new arrivals, false onsets, and time that is known to be without vehicles."""
         new = [k for k, ns in enumerate(hop.emerged_ns) if ns is not None and ns != self.emerged_ns[k]]
         warned_ns, pending_ns = (self.over_ns[k] for k in new), () if new else self.pending_ns
         known_ns = hop.stamp_ns - HORIZON_NS
@@ -170,7 +171,7 @@ class BudgetWatch:
         return replaced(self, tally=tally, onsets=onsets, pending_ns=pending_ns)
 
     def _betted(self, hop: WatchedHop) -> "BudgetWatch":
-        """Return the watch after a bet on the chances of two seconds ago, with the next one laid."""
+        """Return the watch after the bet of two seconds ago is settled and the next one is placed."""
         if self.bet is None:
             return replaced(self, bet=(hop.stamp_ns, hop.within))
         laid_ns, chances = self.bet
@@ -181,7 +182,7 @@ class BudgetWatch:
         return replaced(self, within=within, bet=(hop.stamp_ns, hop.within))
 
     def check(self, sides: int) -> None:
-        """Refuse what a file cannot have been written with."""
+        """Raise an error for values that no checkpoint can contain."""
         laid = self.emerged_ns if self.bet is None else self.bet[1]
         if {len(self.over_ns), len(self.emerged_ns), len(laid)} != {sides}:
             raise InvalidArgumentError(f"memory.sequence.watch: expected values of {sides} sides")
@@ -192,8 +193,8 @@ class BudgetWatch:
 
 
 def budget_of(watch: BudgetWatch, stamp_ns: int, alarm: SequenceAlarm) -> Budget:
-    """Return how the watch over the budget of an alarm stands at a time."""
-    # In full precision they would take twice as long to write.
+    """Return the published state of an alarm's budget at a time."""
+    # Rounded, because full precision takes twice as long to write.
     tests = {"onsets": watch.onsets, "within": watch.within}
     evidence_nats = {name: round(math.log(one.value), 6) for name, one in tests.items()}
     low, high = watch.within.values

@@ -1,4 +1,4 @@
-"""Advisories and cues: the alarm over the belief and what messages announce, and what is published."""
+"""Advisories and risk cues per side, from the belief and from messages."""
 
 import math
 from collections.abc import Iterable
@@ -33,15 +33,15 @@ _Times: TypeAlias = tuple[dict[str, float] | None, tuple[float, float, float] | 
 
 @dataclass(frozen=True, slots=True)
 class SideAdvisory:
-    """The advisory of a side: until when it stands without news, and whether it is only held."""
+    """Advisory of a side: when it ends without news, and whether it only continues from before."""
 
     ends_ns: int
-    held: bool = False  # Below its threshold by now
-    announced: bool = False  # By messages, not by what is heard
+    held: bool = False  # The log-odds are below the threshold now
+    announced: bool = False  # Raised by messages, not by sound
 
 
 def note_source(memory: Memory, measurement: Measurement, model: FilterModel) -> None:
-    """Note how a source is, and what its window alone makes of the policy's reference prior."""
+    """Record the state of a source, and the posterior of its window at the policy's reference prior."""
     source, stamp_ns, domain = measurement.source, measurement.stamp_ns, measurement.domain
     heard = heard_beside(memory, measurement, model.site.street)
     fault = measurement.fault or (domain.reason if isinstance(domain, Foreign) else None)
@@ -50,7 +50,7 @@ def note_source(memory: Memory, measurement: Measurement, model: FilterModel) ->
     memory.sources[source] = SourceState(stamp_ns, fault, heard, since_ns)
     if not measurement.heard.usable:
         return
-    # At the policy's own prior, without memory: the statistic of the paper. Of other sides it has none.
+    # The paper's statistic: the policy's own prior, without memory. Other sets of sides have a uniform prior.
     prior, explanations = model.policy.reference_prior, len(measurement.signature.directions) + 2
     usual = prior if len(prior) == explanations else [1.0 / explanations] * explanations
     found = posterior_of(tuple(map(math.log, usual)), measurement.signature, measurement.co_evidence)
@@ -59,7 +59,7 @@ def note_source(memory: Memory, measurement: Measurement, model: FilterModel) ->
 
 
 def sound_cues(sounds: Iterable[Entity]) -> tuple[RiskCue, ...]:
-    """Return where to look for what sounds: cues without a side, a risk and an advisory."""
+    """Return the directions of tracked sounds as cues without side, risk and advisory."""
     places = [(one.id, one.azimuth_rad, one.azimuth_std_rad) for one in sounds]
     return tuple(
         RiskCue(None, at, std, None, None, None, None, None, entity_id=name, sector_rad=sector(at, std))
@@ -67,34 +67,34 @@ def sound_cues(sounds: Iterable[Entity]) -> tuple[RiskCue, ...]:
     )
 
 
-# No slots: what follows from the memory is computed once, if it is asked for.
+# No slots: derived values are computed once, on demand.
 @dataclass(frozen=True, eq=False)
 class SideAlarms:
-    """The alarms of all sides at one time, and the belief of the sides as it is published."""
+    """Alarms of all sides at one time, with the belief over the sides as it is published."""
 
     memory: Memory
     model: FilterModel
 
     @cached_property
     def sides(self) -> SideBelief:
-        r"""The belief of the sides with the policy's calibration, messages and tracks.
+        r"""The belief over the sides with the policy's calibration, messages and tracks.
 
         .. math:: r_k = \min\big(P(hid),\ g(P(hid))\big)\, P(k \mid hid)
 
-        without a sequence model, whose probabilities are calibrated: of what is hidden at most all comes into
-        view, so that the calibrated map g of the policy can only lower it. It is a map of what windows heard:
-        before the first one the risk is that of the prior, or an array that hears nothing would report a
-        street quieter than any.
+        holds without a sequence model; a sequence model is calibrated already. Not every hidden vehicle
+        comes into view, so the policy's calibrated map g can only lower the risk. The map was fitted to
+        window evidence. Before the first window the risk is that of the prior; the map would make a street
+        without evidence look quieter than any real one.
         """
         belief, tracks = self.memory.belief, self.memory.tracks
         sides = belief.sides
         if belief.read_ns and not belief.has_times:
             hidden = sides.hypotheses[0]
             risk = min(float(self.model.policy.risk_map(hidden)), hidden)
-            # The floor only matters where P(hidden) has underflowed; then no direction has a share.
+            # The floor only matters if P(hidden) has underflowed; no direction has a share then.
             share = risk / max(hidden, TINY)
             sides = replaced(sides, risk=risk, risks=tuple(share * one for one in sides.hidden))
-        # What drives behind the ego explains nothing of what is ahead.
+        # A vehicle behind the ego vehicle does not explain sound from ahead.
         ahead = tracks.seen & tracks.moving & (np.cos(tracks.mean[:, AZIMUTH]) > 0.0)
         unseen = 1.0 - tracks.existence[ahead] * (1.0 - tracks.behind[ahead])
         return sides.at_least(self._announced).beside(float(np.multiply.reduce(unseen)))
@@ -109,7 +109,7 @@ class SideAlarms:
 
     @cached_property
     def _messages(self) -> list[tuple[float, int]]:
-        """Log-odds that an announced road user comes into view, and when that ends without news, by side."""
+        """Log-odds that an announced road user comes into view, and the end of the announcement, by side."""
         memory, tracks = self.memory, self.memory.tracks
         placed, long_ago_ns = tracks.placed & ~tracks.seen, memory.stamp_ns - 2 * NEWS_HOLDS_NS
         updated_ns = [tracks.updated_ns[placed & (tracks.side == k)] for k in range(len(memory.history))]
@@ -122,16 +122,16 @@ class SideAlarms:
         return self.memory.belief.threshold_nats(self.model.policy, self.model.site.street)
 
     def note_announced(self) -> None:
-        """Note on which sides messages reach the threshold now."""
+        """Record the sides on which messages reach the threshold now."""
         for side, (nats, ends_ns) in zip(self.memory.history, self._messages, strict=True):
             if nats >= self._threshold_nats and ends_ns >= self.memory.stamp_ns:
                 side.announced_ns = self.memory.stamp_ns
 
     @cached_property
     def _raised(self) -> list[SideAdvisory | None]:
-        """The advisory of each side at any risk: that by messages if what is heard raises none.
+        """The advisory of each side before its risk is checked; messages raise one if sound does not.
 
-        None is raised in the first second of a sequence, which was counted in no budget.
+        Sound raises none in the first second of a sequence, because the alarm budgets exclude this second.
         """
         memory, belief, stamp_ns = self.memory, self.memory.belief, self.memory.stamp_ns
         ends_ns = belief.alarm_ends_ns(stamp_ns)
@@ -150,7 +150,7 @@ class SideAlarms:
 
     @cached_property
     def advisories(self) -> list[SideAdvisory | None]:
-        """The advisory of each side, None where there is none; none stands beside a risk below 0.1."""
+        """The advisory of each side, or None; there is none at a risk below 0.1."""
         if not any(self._raised):
             return self._raised
         least, pairs = self.model.site.street.death, zip(self._raised, self.sides.risks, strict=True)
@@ -161,7 +161,7 @@ class SideAlarms:
         if not self.memory.counts.measurements:
             return ()
         rested_on = tuple([one for one in sensors if one.condition != "silent"])
-        # All sides together: what is taken out of arrays once.
+        # All sides together, so that arrays are converted once.
         pairs = zip(self._times(), self._evidence(), strict=True)
         return tuple([self._cue(k, times, evidence, rested_on) for k, (times, evidence) in enumerate(pairs)])
 
@@ -176,10 +176,10 @@ class SideAlarms:
         arrival_s = None
         if track is not None and track.approach_heard:
             arrival_s = time_to_arrival(track.motion.inverse_tta_hz, track.motion.inverse_tta_std_hz)
-        # Distance and speed of an announced vehicle tell more than the sound.
+        # The distance and speed of an announced vehicle are more accurate than the sound.
         if track is not None and track.place is not None:
             interval_s = time_to_visible(track.place, site.sides[track.side], site)[1] or interval_s
-        named = memory.last.named  # None of them before the first window
+        named = memory.last.named  # Empty before the first window
         is_named = told is not None or not named or site.sides[k].label in named
         since_ns, entity_id = memory.history[k].advised_ns, None if track is None else track.id
         advisory = held = None
@@ -209,7 +209,7 @@ class SideAlarms:
         )
 
     def _why_none(self, side: int) -> str | None:
-        """Return why a side of high risk has no advisory; None if it is likelier that none comes."""
+        """Return why a side of high risk has no advisory; None if a vehicle is unlikely to come."""
         belief = self.memory.belief
         if self.sides.risks[side] <= self.model.site.street.birth:
             return None
@@ -223,21 +223,21 @@ class SideAlarms:
         return f"it is not sure to {until}, or not for long enough"
 
     def _alpha(self, evidence: EvidenceTerms) -> float | None:
-        """Return the share of hazard-free time in alarm: of the policy, or by a sequence's curve."""
+        """Return the share of hazard-free time in alarm, from the policy or the curve of a sequence model."""
         alpha, alarm = self.model.policy.alpha or None, self.memory.belief.alarm
         if evidence.hypothesis == "hidden" or alpha is None:
             return alpha
         return alarm.promise.alpha if evidence.hypothesis == "coming" and alarm and alarm.promise else None
 
     def _times(self) -> list[_Times]:
-        """Return the probabilities of coming into view, and the time to it if a vehicle is expected."""
+        """Return the chances of coming into view by horizon, and the time until an expected vehicle does."""
         belief = self.memory.belief
         if not belief.has_times:
             return [(None, None)] * len(self.advisories)
         posterior = belief.posterior
         within = posterior.within()[0].tolist()
         soon = np.add.reduce(posterior.groups[0, :, :STATED], 1).tolist()
-        # The times are those of a vehicle that comes: in an empty street they would say nothing.
+        # The times hold for a vehicle that comes; in an empty street they have no meaning.
         stated = [
             chance > (0.5 if told is None else 0.0)
             for told, chance in zip(self.advisories, soon, strict=True)
@@ -250,9 +250,9 @@ class SideAlarms:
         ]
 
     def _evidence(self) -> list[EvidenceTerms]:
-        r"""Return for each side what the alarm goes by: the belief, or messages if they alone raise one.
+        r"""Return the terms of each side's log-odds: of the belief, or of messages if only they raise it.
 
-        With L the log-odds after the prior, what was heard, every look, and messages,
+        With the log-odds :math:`L_j` after the prior, each source of sound, the looks, or messages,
 
         .. math:: t_j = L_j - L_{j-1}
         """

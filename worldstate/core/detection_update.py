@@ -1,4 +1,4 @@
-"""Update by detections: the looks that count, and the entities that they find, miss or announce."""
+"""Update with detections: select new looks, then update the found, missed and announced entities."""
 
 import math
 from collections.abc import Sequence
@@ -46,26 +46,26 @@ from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory
 from .site_model import FilterModel
 from .street_belief import alerted
 
-# Of (theta_dot rad/s, rho 1/s) at the first box: a car at 50 km/h passing at 15 m has .9 rad/s, two
-# deviations. A parked one has none.
+# Deviation of (theta_dot rad/s, rho 1/s) at the first box. A car at 50 km/h in 15 m has 0.9 rad/s, which
+# is two deviations; a parked car has none.
 _NEW_RATE_STD, _PARKED_RATE_STD = 0.5, LEAST_STD
 
 
 def new_looks(
     memory: Memory, measurement: Measurement, start_ns: int, street: StreetModel
 ) -> tuple[Measurement, list[tuple[CameraLook, float]]]:
-    r"""Note the looks of a measurement; return it, and the new ones, weighed.
+    r"""Record the looks of a measurement; return the measurement, and the new looks with their weights.
 
     .. math:: \kappa = \min(dt / T, 1), \quad T = look interval
 
-    by the time since the last look of the sensor. A look belongs to the sensor that looked. Carried by a
-    second source, or delivered again, it says nothing new; the source that carried it first keeps its answer,
-    since each of its windows is weighed anew.
+    with the time dt since the last look of the sensor. A look belongs to its sensor: repeated delivery, also
+    by a second source, adds nothing. The first source to deliver it keeps the answer, because each of its
+    windows has its own weight.
     """
     new = []
     for one in measurement.looks:
         look, last = one.look, memory.looks.get(one.look.sensor)
-        # One stray stamp must not hide the looks after it, nor an image of long ago be new for ever.
+        # A stray future stamp must not block the looks after it, and a very old image must not stay new.
         in_time = -FORGOTTEN_NS < look.stamp_ns - measurement.stamp_ns <= LAG_NS
         if in_time and (last is None or look.stamp_ns > last.stamp_ns):
             since_s = seconds(look.stamp_ns - (start_ns if last is None else last.stamp_ns))
@@ -82,11 +82,11 @@ def new_looks(
 def update_looks(
     memory: Memory, measurement: Measurement, looks: Sequence[tuple[CameraLook, float]], model: FilterModel
 ) -> None:
-    """Update the memory with the new looks of a measurement, all cameras at once."""
+    """Update the memory with the new looks of a measurement, all cameras together."""
     asked, tracks = measurement.co_evidence, memory.tracks
     unasked = [isinstance(seen.look.answer, Unqueried) and not seen.sightings for seen, _ in looks]
     if looks and all(unasked) and isinstance(asked, Unqueried) and True not in tracks.detected:
-        # Nothing has looked, and nothing is there that a look finds: the answer alone changes.
+        # No sensor has looked, and no track could be found by a look: only the answer changes.
         tracks.answer[:], tracks.miss_rate[:] = "unqueried", math.nan
     elif looks:
         site = model.site
@@ -95,7 +95,7 @@ def update_looks(
 
 
 def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> None:
-    """Update the memory with the positions of a radar or a radio: entities, and announced hidden ones."""
+    """Update the memory with the positions from a radar or from messages."""
     street, last, before = model.site.street, memory.looks.get(scan.source), memory.belief
     elapsed_s = math.inf if last is None else seconds(scan.stamp_ns - last.stamp_ns)
     scans = [position_scan(scan, min(elapsed_s / street.look_s, 1.0), street)]
@@ -106,13 +106,13 @@ def update_positions(memory: Memory, scan: PositionScan, model: FilterModel) -> 
 
 
 def _scan_look(scan: PositionScan) -> CountedLook:
-    """Return a scan as a look at its sector, or at none where it is of messages."""
+    """Return a scan as a look at its sector; messages have no sector."""
     searched = scan.searched
     if searched is None:
         return CountedLook(scan.stamp_ns, scan.source)
     miss, half_rad = 1.0 - searched.detection_probability, searched.sector.half_width_rad
     answer = (Present if scan.positions else Absent)(miss, searched.clutter_rate)
-    centre_rad = searched.sector.centre_rad if half_rad < math.pi else 0.0  # A full turn has no end
+    centre_rad = searched.sector.centre_rad if half_rad < math.pi else 0.0  # A full turn has no ends
     right_rad, left_rad = (math.remainder(centre_rad + way * half_rad, math.tau) for way in (-1.0, 1.0))
     return CountedLook(scan.stamp_ns, scan.source, answer, (right_rad, left_rad))
 
@@ -120,9 +120,9 @@ def _scan_look(scan: PositionScan) -> CountedLook:
 def detection_update(
     memory: Memory, scans: Sequence[Scan], asked: CoEvidence | None, stamp_ns: int, site: SiteGeometry
 ) -> None:
-    """Update the memory with all looks of an instant, whose order carries no meaning.
+    """Update the memory with all looks of an instant; their order has no effect.
 
-    `asked` is what cameras answer of the sector of a sound; None of positions.
+    `asked` is the cameras' answer for the sector of the sound; it is None for positions.
     """
     known, (detections, by_look) = memory.tracks, fused(scans)
     in_sight, n = detections.in_sight, len(known)
@@ -130,7 +130,7 @@ def detection_update(
         detections = detections.seen_through(site)
     whose = associated(known, detections, site)
     if in_sight:
-        # A detection that may be of a known entity is a new one the less.
+        # The likelier a detection belongs to a known entity, the less likely it is a new one.
         detections = replaced(detections, existence=detections.existence * whose.unclaimed)
     born = [_born(memory, detections, j, scans[0], stamp_ns, site) for j in whose.new]
     memory.tracks = tracks = known.joined(born)
@@ -142,7 +142,7 @@ def detection_update(
         hits, existence = np.minimum(whose.pairs.T @ by_look, 1.0), tracks.existence.copy()
         existence[:n], detected = _existence(known, hits, scans, site.street)
         tracks.behind[:n] = _hidden(known, detected, chances[:n], bool(detections.positions), site.street)
-        # What was only heard is found, or another one is.
+        # The detection is either the sound-only entity or another vehicle.
         first = ((detection[:n] >= 0) & ~known.detected).nonzero()[0]
         another = (1.0 - chances[first]) * detections.existence[detection[first]]
         existence[first], tracks.behind[first] = chances[first] + another, 0.0
@@ -162,7 +162,7 @@ def detection_update(
 
 
 class _Found(NamedTuple):
-    """Which entities were found, by which detections, and the chances that these were theirs, row by row."""
+    """Rows of the found entities, their detections, and the probability of each match."""
 
     rows: IndexArray
     by: IndexArray
@@ -173,7 +173,7 @@ class _Found(NamedTuple):
 def _born(
     memory: Memory, detections: Detections, by: int, scan: Scan, stamp_ns: int, site: SiteGeometry
 ) -> Track:
-    """Return a new entity before its detection counts; hidden where messages say so."""
+    """Return a new entity before its detection is applied; hidden if a message places it out of sight."""
     azimuth_rad = float(detections.azimuth_rad[by])
     side = None if detections.in_sight else site.hiding_side(detections.positions[by].position_m)
     existence = min(float(detections.existence[by]), 1.0 - site.street.doubt)
@@ -187,15 +187,15 @@ def _born(
 def _existence(
     tracks: Tracks, hits: FloatArray, scans: Sequence[Scan], street: StreetModel
 ) -> tuple[FloatArray, FloatArray]:
-    r"""Return the existence after every look s of an instant, and P(a look detects it | in line of sight).
+    r"""Return the existence after all looks s of an instant, and P(a look detects it | in line of sight).
 
-    With the chance c that a look has detected it,
+    With the chance c that a look has detected the entity,
 
     .. math:: r_s = c_s + (1 - c_s)\, \frac{r (1 - p_s)}{1 - r p_s}, \qquad
               p_s = p_D\, P_{range}\, (1 - P_{hidden}), \qquad
               \frac{r'}{1 - r'} = \frac{r}{1 - r} \prod_s \frac{r_s}{1 - r_s} \frac{1 - r}{r}
 
-    Of what is only heard the belief of its side decides.
+    A sound-only entity keeps its existence, which follows from the belief over the sides.
     """
     r = np.minimum(np.maximum(tracks.existence, TINY), 1.0 - TINY)
     detected = np.zeros(len(r))
@@ -217,8 +217,8 @@ def _hidden(
 
     .. math:: P = c\, \frac{b q}{b q + 1 - b} + (1 - c)\, \frac{b}{b + (1 - b)(1 - p)}
 
-    with P(hidden) b before, P(detected | in line of sight) p, and for what is hidden q times as much: a radar
-    also finds some of that, by multipath and diffraction.
+    with the earlier P(hidden) b and p = P(detected | in line of sight). A hidden entity is detected q times
+    as often: a radar also finds some by multipath and diffraction.
     """
     b, q = tracks.behind, street.hidden_return if by_radar else 0.0
     found = b * q / np.maximum(b * q + 1.0 - b, TINY)
@@ -227,7 +227,7 @@ def _hidden(
 
 
 def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
-    """Return P(a look covers it) of every track, by the range of the sensor in its sector."""
+    """Return P(a look covers a track) for every track, from the sector and the range of the sensor."""
     if scan.sector is None or scan.miss_rate is None:
         return np.zeros(len(tracks))
     from_centre_rad = np.abs(wrap_angle(tracks.mean[:, AZIMUTH] - scan.sector.centre_rad))
@@ -240,8 +240,7 @@ def _searched(tracks: Tracks, scan: Scan) -> FloatArray:
 
 
 def _told(tracks: Tracks, found: _Found, source: str, most: float) -> FloatArray:
-    """Return the existence after messages."""
-    # A sender that lies in one message lies in the next: what a source repeats counts once.
+    # Messages of one sender are fully dependent: only the first one updates existence.
     news = np.array([source not in tracks.sources[i] for i in found.rows.tolist()], bool)
     rows, told = found.rows[news], found.detections.existence[found.by[news]]
     odds, before = told / (1.0 - told), np.minimum(tracks.existence[rows], most)
@@ -251,7 +250,6 @@ def _told(tracks: Tracks, found: _Found, source: str, most: float) -> FloatArray
 
 
 def _move(tracks: Tracks, found: _Found, street: StreetModel) -> None:
-    """Update the motion or the place of the found tracks with what was measured of them."""
     rows, by, chances, detections = found
     placed = tracks.placed[rows] | bool(detections.positions)
     usual = ~placed & tracks.seen[rows] & (detections.moving[by] == tracks.moving[rows])
@@ -267,7 +265,7 @@ def _move(tracks: Tracks, found: _Found, street: StreetModel) -> None:
 def _placed(
     tracks: Tracks, row: int, detections: Detections, by: int, street: StreetModel
 ) -> CartesianBelief:
-    """Return the place of a track after a position, or after a bearing of what has a place."""
+    """Return the position of a track after a measured position, or after a bearing if it had a position."""
     place = tracks.place(row)
     if place is None:
         place, (azimuth_rad, *_) = at_position(detections.positions[by], street.speed_mps), tracks.mean[row]
@@ -278,7 +276,7 @@ def _placed(
 
 
 def _motion_at(tracks: Tracks, row: int, boxes: Detections, by: int, street: StreetModel) -> MotionBelief:
-    """Return the motion belief at a box, with approach rate and range of an earlier belief."""
+    """Return the motion belief at a box; a moving one keeps its earlier approach rate and range."""
     moving = boxes.moving[by] > 0.0
     rate_std = _NEW_RATE_STD if moving else _PARKED_RATE_STD
     expected = [boxes.azimuth_rad[by], 0.0, 0.0, math.log(street.range_m)]
@@ -290,7 +288,7 @@ def _motion_at(tracks: Tracks, row: int, boxes: Detections, by: int, street: Str
 
 
 def _see(tracks: Tracks, found: _Found, scans: Sequence[Scan], stamp_ns: int, site: SiteGeometry) -> None:
-    """Update the found tracks; those not in view before take their side and class there."""
+    """Update the found tracks; those that were not in view take side and class from the detection."""
     rows, by, chances, detections = found
     azimuth_rad, moving = detections.azimuth_rad[by], detections.moving[by]
     gains = site.street.label_gain, site.street.doubt
@@ -305,7 +303,7 @@ def _see(tracks: Tracks, found: _Found, scans: Sequence[Scan], stamp_ns: int, si
     tracks.updated_ns[rows] = stamp_ns
     tracks.moving[rows] = np.where(np.isnan(moving), tracks.moving[rows], moving > 0.0)
     if detections.positions:
-        tracks.approach_heard[rows] = True  # By the velocity of its position
+        tracks.approach_heard[rows] = True  # The velocity of its position gives an approach rate
     else:
         tracks.width_rad[rows] = detections.width_rad[by]
     if detections.in_sight:
@@ -314,7 +312,7 @@ def _see(tracks: Tracks, found: _Found, scans: Sequence[Scan], stamp_ns: int, si
 
 
 def _hide(tracks: Tracks, site: SiteGeometry) -> None:
-    """Put the tracks that a corner hides on its side; what has a place is announced there."""
+    """Assign tracks behind a corner to the corner's side; those with a position are no longer in view."""
     rows = (tracks.detected & (tracks.behind >= HIDDEN)).nonzero()[0]
     if len(rows):
         by = occluded(tracks, site)[rows].argmax(axis=1)
@@ -324,11 +322,11 @@ def _hide(tracks: Tracks, site: SiteGeometry) -> None:
 
 
 def _miss(memory: Memory, rows: IndexArray, scans: Sequence[Scan], asked: CoEvidence | None) -> None:
-    """Update the last answer about the tracks that none of the looks of an instant has found."""
+    """Update the last answer about the tracks that no look of an instant has found."""
     tracks, views = memory.tracks, _other_views(memory, scans)
     azimuth_rad, detected = tracks.mean[rows, AZIMUTH], tracks.detected[rows]
-    # Where only other cameras have looked, or a radar elsewhere, the last answer holds. What is only heard
-    # was asked of in the sector of its sound.
+    # If only other cameras, or a radar elsewhere, have looked, the last answer holds. Sound-only entities
+    # were searched for in the sector of their sound.
     rates, holds = miss_rates(scans, azimuth_rad), np.full(len(rows), asked is None)
     rates[~detected] = asked.miss_rate if isinstance(asked, Absent) else math.nan
     if asked is not None:
@@ -342,7 +340,7 @@ def _miss(memory: Memory, rows: IndexArray, scans: Sequence[Scan], asked: CoEvid
 
 
 def _other_views(memory: Memory, scans: Sequence[Scan]) -> list[Sector]:
-    """Return where cameras with a sector of their own looked in the last second."""
+    """Return the sectors that cameras with their own sector searched in the last second."""
     looks = memory.looks.values() if any(one.names_sector for one in scans) else ()
     recent = (one for one in looks if memory.stamp_ns - one.stamp_ns <= NEWS_HOLDS_NS)
     asked = (one for one in recent if not isinstance(one.answer, Unqueried))

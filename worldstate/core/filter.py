@@ -1,4 +1,4 @@
-"""The filter: predict and update of the whole world-state, and its checkpoint, which loses no bit."""
+"""The filter of the whole world-state, with a bit-exact checkpoint."""
 
 import math
 from collections.abc import Iterator
@@ -31,25 +31,25 @@ MOST_SIDES = 3
 
 @dataclass(frozen=True, eq=False)
 class WorldFilter:
-    """Keeps S_t: `predict` and `update` return a new filter, `state` is the snapshot.
+    """Filter of the world-state S_t: `predict` and `update` return a new filter, `state` is the snapshot.
 
     Parameters
     ----------
     context : Context
         Rates, occluders, ego motion.
     policy : CueingPolicy
-        Threshold and risk map; a model file brings one.
+        Threshold and risk map; a model file contains one.
     settings : FilterSettings
         Windows, births and deaths.
     start_ns : int
-        Time of the first belief, ns on the clock of the measurements.
+        Time of the first belief, ns, on the clock of the measurements.
     memory : Memory, optional
-        What another filter carried; the first belief where not given.
+        Memory of another filter; by default the belief before any measurement.
     lag : FixedLag, optional
-        Measurements of the last two seconds, among which a late one is put; none where not given.
+        Measurements of the last two seconds, for the insertion of late ones; by default none.
     no_model : NotUsable, optional
-        Why no model reads the sound, if none does. The snapshots then hold tracks of sound in place of what
-        is hidden, and cues without a side, a risk and an advisory.
+        Why no model interprets the sound, if none does. Snapshots then contain tracks of sound instead of
+        hidden entities, and cues without side, risk and advisory.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class WorldFilter:
 
     @property
     def belief(self) -> SideBelief:
-        """What is believed of the sides, of which the snapshot states marginals."""
+        """Belief over the sides; the snapshot contains its marginals."""
         return SideAlarms(self._memory, from_here(self._model, self._memory.ego)).sides
 
     @property
@@ -107,7 +107,7 @@ class WorldFilter:
         model = from_here(self._model, memory.ego)
         context = model.context
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings.street)
-        # Those of the last step hold until time passes, or odometry moves the place.
+        # The last step's relations stay valid until time passes or odometry moves the ego vehicle.
         is_fresh = memory is self._lag.latest and memory.ego is None
         sounds, before = sound_entities(memory.sounds, settings), last.predicted or memory.sides.hypotheses
         state = WorldState(
@@ -150,39 +150,38 @@ class WorldFilter:
         Raises
         ------
         InvalidArgumentError
-            If that time is no integer or is earlier than the belief's.
+            If the time is not an integer or is before the belief.
         """
         stamp_ns = integer_ns("stamp_ns", stamp_ns)
         if stamp_ns < self.stamp_ns - SLACK_NS:
             problem = f"expected a time not before {self.stamp_ns} ns, got {stamp_ns} ns"
             raise InvalidArgumentError(f"stamp_ns: {problem}")
-        if stamp_ns <= self.stamp_ns:  # Within the slack: the belief is not moved back
+        if stamp_ns <= self.stamp_ns:  # Within the slack: the belief does not go back
             return self
-        # From the last measurement on, so that many small steps are one step to the bit.
+        # Predicted from the last measurement, so that many small steps equal one step to the bit.
         return self._with(advanced(self._lag.latest, stamp_ns, self._model), self._lag)
 
     def update(self, measurement: Timed) -> "WorldFilter":
-        """Return the filter after a measurement or a scan, at its stamp or, if that has passed, the belief's.
+        """Return the filter after a measurement or a scan, at its stamp or the belief's, whichever is later.
 
-        A measurement that is up to two seconds late is put where it belongs, as if it had come in time. One
-        that was delivered before is dropped, and one that is later still; `WorldState.delivery` counts them.
-        Where everything comes too late for a second, clocks were changed: the belief begins anew. One that is
-        ahead of all others, and of the belief, by more than two seconds waits until a second one is, too. Of
-        an image 64 boxes count.
+        A measurement that is up to two seconds late takes effect at its own time. Repeated measurements, and
+        those that are even later, are dropped and counted in `WorldState.delivery`. If everything is too late
+        for a second, a clock was changed, and the belief restarts. A measurement more than two seconds ahead
+        of the belief and of all others is held until a second one confirms its stamp. Only 64 boxes of an
+        image are used.
 
         Raises
         ------
         InvalidArgumentError
-            If none of its directions is one of the context; what a measurement consists of is checked when it
-            is built.
+            If the measurement has no direction of the context. Its values are checked when it is built.
         """
-        # Before anything is computed: a measurement that is refused leaves the filter as it was.
+        # First, so that a refused measurement leaves the filter unchanged.
         measurement, left_out = _fitting(measurement, self.context)
         lag = self._lag.add(measurement, self.stamp_ns, self._step)
         if lag is None:
             return self._begun_anew(measurement)
         if lag.latest is not self._lag.latest:
-            # From what was published last on: a late measurement changes what has become of it since.
+            # Compared with the last published tracks, because a late measurement changes all steps after it.
             steps = (*[one.before for one in lag.arrivals], lag.latest)
             known, now = (published(one.latest.tracks, self.settings.street) for one in (self._lag, lag))
             lag.latest.last.events = (*events_between(known, now, steps), *self._sound_events(lag.latest))
@@ -191,28 +190,28 @@ class WorldFilter:
         return world if self.stamp_ns <= world.stamp_ns + SLACK_NS else world.predict_to(self.stamp_ns)
 
     def _sound_events(self, latest: Memory) -> Iterator[Event]:
-        """Yield which tracks of sound have ended or begun since the last measurement."""
+        """Yield the tracks of sound that have ended or begun since the last measurement."""
         both = (sound_entities(one.sounds, self.settings) for one in (self._lag.latest, latest))
         known, now = ([one.id for one in sounds] for sounds in both)
         yield from (Event(latest.stamp_ns, "died", name) for name in known if name not in now)
         yield from (Event(latest.stamp_ns, "born", name) for name in now if name not in known)
 
     def refused(self, inputs: int) -> "WorldFilter":
-        """Return the filter, whose `WorldState.delivery` counts so many more inputs refused before it."""
+        """Return the filter with more refused inputs counted in `WorldState.delivery`."""
         return self._with(self._memory, self._lag.counted(refused=inputs)) if inputs else self
 
     def _step(self, memory: Memory, measurement: Timed) -> Memory:
-        """Return the memory after one more measurement, not earlier than the last one."""
+        """Return the memory after one more measurement, which is not earlier than the last one."""
         is_predicted = memory is self._lag.latest and measurement.stamp_ns == self.stamp_ns
         latest = self._memory if is_predicted else memory
-        # Within the slack the belief is not moved back.
+        # Within the slack the belief does not go back.
         is_later = measurement.stamp_ns > latest.stamp_ns
         draft = advanced(latest, measurement.stamp_ns, self._model) if is_later else latest.draft()
         take_in(memory, draft, measurement, self.start_ns, self._model)
         return draft
 
     def _with(self, memory: Memory, lag: FixedLag) -> "WorldFilter":
-        """Return the filter with another memory; what follows from its configuration is the same."""
+        """Return the filter with another memory and the same configuration."""
         world = replaced(self, memory=memory, lag=lag)
         vars(world)["_model"] = self._model
         return world
@@ -224,7 +223,7 @@ class WorldFilter:
         return replaced(self, start_ns=measurement.stamp_ns, memory=fresh, lag=lag).update(measurement)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a checkpoint as JSON-able values: what is read back continues bit for bit.
+        """Return a checkpoint of JSON-compatible values; a filter read from it continues bit for bit.
 
         Examples
         --------
@@ -234,20 +233,20 @@ class WorldFilter:
         """
         lag, measurements = self._lag, tuple(one.measurement for one in self._lag.arrivals)
         past = LagRecord(self.stamp_ns, lag.base, measurements, lag.delivery, lag.late_since_ns, lag.held)
-        # What was predicted since the last measurement is predicted again.
+        # Predictions since the last measurement are computed again when the checkpoint is read.
         given = self.context, self.policy, self.settings, self.start_ns
         return encode(FilterRecord(*given, lag.latest, past, self.no_model))
 
     @classmethod
     def from_dict(cls, value: object) -> "WorldFilter":
-        """Return the filter that `to_dict` wrote.
+        """Return the filter of a checkpoint that `to_dict` wrote.
 
         Raises
         ------
         SchemaVersionError
             On another schema or another major version.
         InvalidArgumentError
-            If a value is missing, of the wrong type or out of range; the message says where.
+            If a value is missing, has the wrong type or is out of range; the message gives its place.
         """
         kept = decode(FilterRecord, value, "checkpoint")
         past, latest = kept.past, kept.memory
@@ -272,7 +271,7 @@ class WorldFilter:
 
 @dataclass(frozen=True, slots=True)
 class FilterRecord:
-    """All of a filter, as it is written."""
+    """A filter as it is written to a checkpoint."""
 
     LAYOUT: ClassVar = Layout("worldstate.Filter", "4.0.0")
 
@@ -293,9 +292,9 @@ class FilterRecord:
 
 
 def _fitting(measurement: object, context: Context) -> tuple[Timed, int]:
-    """Return a measurement at the time it was taken, with the boxes that count, and how many do not.
+    """Return a measurement at the time it was taken, with at most `MOST_BOXES` boxes, and how many were cut.
 
-    One that does not fit the context is refused.
+    A measurement that does not fit the context raises an error.
     """
     if isinstance(measurement, PositionScan):
         return replaced(measurement, stamp_ns=measurement.observed_ns, latency_s=0.0), 0
@@ -316,5 +315,5 @@ def _fitting(measurement: object, context: Context) -> tuple[Timed, int]:
 
 
 def _first_counting(one: Sighting) -> tuple[object, ...]:
-    """Return what boxes count by: moving ones and high scores first, however a detector lists them."""
+    """Return the sort key of boxes: moving ones and high scores first, independent of their order."""
     return not one.moving, -one.score, BY_ALL(one)

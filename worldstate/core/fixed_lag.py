@@ -1,8 +1,8 @@
-"""Fixed-lag buffer: what came in during the last seconds, so that a late measurement is put in its place.
+"""Fixed-lag buffer: the measurements of the last seconds, so that a late one takes effect at its own time.
 
-Order of arrival carries no meaning: a measurement that comes after later ones is taken in at its own time,
-and those after it once more. One that was delivered before is dropped, one older than the lag is counted. One
-that is ahead of all others by more than the lag waits until another one confirms its stamp.
+The order of arrival has no effect: a late measurement is inserted at its own time, and later ones are applied
+again. A repeated one, or one older than the lag, is dropped. One that is ahead of all others by more than the
+lag waits until another one confirms its stamp.
 """
 
 from bisect import bisect_left
@@ -19,10 +19,9 @@ from worldstate.state import Delivery
 
 from .memory import Memory
 
-# Cameras and radios come up to half a second behind the sound; two seconds leave room for a bus that stalls.
+# Cameras and radios are up to half a second behind the sound; two seconds also cover a slow data bus.
 LAG_NS = nanoseconds(2.0)
-# Everything being too late for so long is no delay: the clock was set back. The filter begins anew at the
-# time that is told now.
+# If every measurement is too late for this long, the clock was set back. The filter restarts at the new time.
 REANCHOR_NS = nanoseconds(1.0)
 
 Timed: TypeAlias = Measurement | PositionScan | Odometry
@@ -31,7 +30,7 @@ Step: TypeAlias = Callable[[Memory, Timed], Memory]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
-    """A measurement, and the memory that it was added to."""
+    """A measurement, and the memory before it."""
 
     measurement: Timed
     before: Memory
@@ -39,7 +38,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FixedLag:
-    """The arrivals of the lag, and the memory after the last of them."""
+    """Measurements of the lag, and the memory after the last of them."""
 
     latest: Memory
     arrivals: tuple[Arrival, ...] = ()
@@ -53,10 +52,10 @@ class FixedLag:
         return self.arrivals[0].before if self.arrivals else self.latest
 
     def add(self, measurement: Timed, now_ns: int, step: Step) -> "FixedLag | None":
-        """Return the buffer with one more measurement; None where all have been too late for a second.
+        """Return the buffer with one more measurement; None if all have been too late for a second.
 
-        A stamp that is ahead of `now_ns`, the time that the belief was predicted to, by more than the lag is
-        held back, and taken with the next one that is ahead of all others, too, and about as far.
+        A measurement that is ahead of `now_ns`, the time of the predicted belief, by more than the lag is
+        held. It is applied when another one is about as far ahead of all others.
         """
         stamp_ns, held = measurement.stamp_ns, self.held
         if any(_delivery(one) == _delivery(measurement) for one in (*self._at(stamp_ns), held) if one):
@@ -75,22 +74,22 @@ class FixedLag:
         return replaced(self, held=None if refuted else held)._taken(measurement, step)
 
     def _agree(self, held_ns: int, stamp_ns: int) -> bool:
-        """Tell whether two stamps are ahead of all others, and as near to each other as to these."""
+        """Return whether two stamps are ahead of all others and close to each other."""
         latest_ns = self.latest.stamp_ns
         near = -LAG_NS <= stamp_ns - held_ns <= max(LAG_NS, held_ns - latest_ns)
         return near and self._is_ahead(held_ns, latest_ns) and self._is_ahead(stamp_ns, latest_ns)
 
     def _is_ahead(self, stamp_ns: int, now_ns: int) -> bool:
-        """Tell whether a stamp is ahead of all others, and of the belief, by more than a delay explains."""
+        """Return whether a stamp is too far ahead of all others, and of the belief, to be a delay."""
         if not self.arrivals:
-            return False  # Of none
+            return False  # There is nothing to compare with
         last = self.arrivals[-1]
-        # A slow stream goes on at its own pace; the first measurement of all has none.
+        # A slow stream may continue at its own interval; before a second measurement there is no interval.
         pace_ns = last.measurement.stamp_ns - last.before.stamp_ns if last.before.counts.measurements else 0
         return stamp_ns - max(now_ns, self.latest.stamp_ns) > max(LAG_NS, 2 * pace_ns)
 
     def _taken(self, measurement: Timed, step: Step) -> "FixedLag":
-        """Return the buffer with a measurement in its place, and those after it taken in once more."""
+        """Return the buffer with a measurement at its time, and all later ones applied again."""
         same = self._at(measurement.stamp_ns)
         at = bisect_left(self.arrivals, measurement.stamp_ns, key=_STAMP_NS)
         at += sum(_content(one) < _content(measurement) for one in same)
@@ -103,22 +102,21 @@ class FixedLag:
         return replaced(counted, latest=memory, arrivals=tuple(kept[oldest:]), late_since_ns=None)
 
     def _at(self, stamp_ns: int) -> list[Timed]:
-        """Return what was taken of one instant, in its order."""
         return [one.measurement for one in self.arrivals if one.measurement.stamp_ns == stamp_ns]
 
     def counted(self, **more: int) -> "FixedLag":
-        """Return the buffer with some counts of its delivery raised."""
+        """Return the buffer with higher numbers in its delivery report."""
         counts = {name: getattr(self.delivery, name) + number for name, number in more.items()}
         return replaced(self, delivery=replaced(self.delivery, **counts))
 
 
 _STAMP_NS = attrgetter("measurement.stamp_ns")
-# What a delivery is known by; one source measures one thing at a time.
+# The key of a delivery; a source takes one measurement at a time.
 _delivery = attrgetter("stamp_ns", "source")
 
 
 def _content(measurement: Timed) -> tuple[int, str]:
-    """Return what measurements of one instant are in order of: their kind, and all of them but names."""
+    """Return the sort key of measurements of one instant: their kind, then their content without names."""
     if not isinstance(measurement, Measurement):
         order = 0 if isinstance(measurement, Odometry) else 2 + (measurement.searched is None)
         return order, str(encode(replaced(measurement, source="-")))
@@ -131,7 +129,7 @@ def _content(measurement: Timed) -> tuple[int, str]:
 class LagRecord:
     """Measurements of the last two seconds, and the memory before the first of them."""
 
-    stamp_ns: int  # Of the belief, predicted since the last measurement
+    stamp_ns: int  # Time of the belief, which may be later than the last measurement
     base: Memory
     measurements: tuple[Timed, ...]
     delivery: Delivery
@@ -140,7 +138,7 @@ class LagRecord:
 
 
 def restored(latest: Memory, past: LagRecord, step: Step) -> FixedLag:
-    """Return the buffer of a checkpoint, with the memory before each of its measurements computed anew."""
+    """Return the buffer of a checkpoint; the memory before each measurement is computed again."""
     befores = accumulate(past.measurements, step, initial=past.base)
     arrivals = tuple(map(Arrival, past.measurements, befores))
     return FixedLag(latest, arrivals, past.delivery, past.late_since_ns, past.held)

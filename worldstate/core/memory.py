@@ -18,18 +18,18 @@ from worldstate.state import Context, Event, Relation
 
 from .street_belief import StreetBelief
 
-# An advisory lives in time: without news it ends, as that of a sequence does, after a second.
+# Without news an advisory ends after a second, like the alarm of a sequence model.
 NEWS_HOLDS_NS = nanoseconds(1.0)
-# Names come and go; without this, a checkpoint holds every one that was ever told.
+# Names come and go; without a limit a checkpoint would keep all of them.
 FORGOTTEN_NS = nanoseconds(SECONDS_PER_HOUR)
-# Of an image, and of the events of a step; a crowded street shows some forty, and at 600 a step took 0.3 s.
+# Per image, and for the events of a step. A crowded street has some forty; with 600 a step took 0.3 s.
 MOST_BOXES = 64
 ValueT = TypeVar("ValueT")
 
 
 @dataclass(frozen=True, slots=True)
 class SourceState:
-    """When a source last measured, what was wrong then, and how well it could hear, and since when."""
+    """Last stamp of a source, its fault, and its share of audible vehicles with the start of that state."""
 
     stamp_ns: int
     fault: str | None = None
@@ -39,60 +39,60 @@ class SourceState:
 
 @dataclass(frozen=True, slots=True)
 class CountedLook:
-    """The last look of a sensor, what it said, and the source whose measurement carried it first."""
+    """Last look of a sensor, its answer, and the source that delivered it first."""
 
     stamp_ns: int
     source: str
     answer: CoEvidence = field(default=Unqueried("messages search nothing"))
-    sector_rad: tuple[float, float] | None = None  # Where it searched; None for the view of the context
+    sector_rad: tuple[float, float] | None = None  # The searched sector; None for the context's view
     fault: str | None = field(default=None, metadata=ADDED)
 
 
 @dataclass
 class SideHistory:
-    """What happened on one approach side so far."""
+    """History of one approach side."""
 
     births: Count = 0  # Hidden entities born
-    advised_ns: int | None = None  # Since when an advisory has been out
-    announced_ns: int | None = None  # When messages last raised the alarm: time alone raises none
+    advised_ns: int | None = None  # Start of the present advisory
+    announced_ns: int | None = None  # When messages last raised the alarm; time alone raises none
 
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """What one window says by itself, at the policy's reference prior; JSON knows no infinity."""
+    """Result of one window alone, at the policy's reference prior."""
 
     statistic: Probability | None = None  # P(hidden), all directions together
-    log_lambda: float | None = None  # None for a ratio without bound
+    log_lambda: float | None = None  # None for an infinite ratio, which JSON cannot represent
 
 
 @dataclass
 class LastSaid:
-    """What the last measurements said, as a snapshot states it."""
+    """Results of the last measurements, for the snapshot."""
 
     # P(hidden), P(visible), P(none) before the last evidence; None before the first.
     predicted: tuple[Probability, Probability, Probability] | None = None
-    instant: Instant = Instant()  # Of the last window
+    instant: Instant = Instant()  # Result of the last window
     bearing: Bearing | None = None
     domain: DomainVerdict | None = None
     named: tuple[str, ...] = ()  # Sides that its evidence distinguishes
-    no_sequence: NotUsable | None = None  # Why it did not say when vehicles come into view
+    no_sequence: NotUsable | None = None  # Why it gave no times to visible
     events: tuple[Event, ...] = ()
 
 
 @dataclass
 class Counts:
-    """How many there were so far."""
+    """Counters since the start."""
 
     measurements: Count = 0
     sighted: Count = 0  # Entities born in view
-    left_out: Count = 0  # Entities beyond the most that are kept
+    left_out: Count = 0  # Entities beyond the limit
 
 
 @dataclass(eq=False)
 class Memory:
-    """State of a filter, as checkpoints hold it; everything else in a filter is configuration.
+    """State of a filter, as in a checkpoint; everything else in a filter is configuration.
 
-    A step writes into a draft of its own; what a filter or its buffer holds is not changed.
+    A step writes into its own draft; the memories of a filter and of its buffer do not change.
     """
 
     stamp_ns: int  # Time of the belief
@@ -103,15 +103,15 @@ class Memory:
     )
     counts: Counts = field(default_factory=Counts)
     last: LastSaid = field(default_factory=LastSaid)
-    sources: dict[str, SourceState] = field(default_factory=dict)  # By the source
-    looks: dict[str, CountedLook] = field(default_factory=dict)  # Last one by the sensor
-    relations: tuple[Relation, ...] = ()  # With the intervals in which they have held
-    ego: EgoBelief | None = None  # By odometry; None without
-    sounds: tuple[SoundTrack, ...] = field(default=(), metadata=ADDED)  # Where no model reads the sound
+    sources: dict[str, SourceState] = field(default_factory=dict)
+    looks: dict[str, CountedLook] = field(default_factory=dict)  # Last look by sensor
+    relations: tuple[Relation, ...] = ()  # Relations with their intervals
+    ego: EgoBelief | None = None  # Pose from odometry; None without odometry
+    sounds: tuple[SoundTrack, ...] = field(default=(), metadata=ADDED)  # Used if no model reads the sound
 
     @property
     def sides(self) -> SideBelief:
-        """Marginals of the belief of the sides; messages not yet taken in."""
+        """Marginals of the belief over the sides, without messages."""
         return self.belief.sides
 
     def draft(self) -> "Memory":
@@ -123,7 +123,7 @@ class Memory:
         return own
 
     def forget(self) -> None:
-        """Drop sources and sensors that have been unheard for an hour."""
+        """Remove sources and sensors without data for an hour."""
         since_ns = self.stamp_ns - FORGOTTEN_NS
         self.sources = {name: one for name, one in self.sources.items() if one.stamp_ns >= since_ns}
         self.looks = {name: one for name, one in self.looks.items() if one.stamp_ns >= since_ns}
@@ -131,16 +131,16 @@ class Memory:
 
 
 def draft_of(value: ValueT) -> ValueT:
-    """Return a copy to write into; what its fields hold is not copied, it is replaced as a whole."""
-    # A copied dictionary takes a tenth of the time of `dataclasses.replace`: hence no slots.
+    """Return a copy to write into; its fields share their values, which are only replaced as a whole."""
+    # Copying the dictionary takes a tenth of the time of `dataclasses.replace`: hence no slots.
     own = object.__new__(type(value))
     own.__dict__.update(value.__dict__)
     return own
 
 
 def first_memory(context: Context, settings: FilterSettings, start_ns: int) -> Memory:
-    """Return the memory of a filter that has measured nothing."""
+    """Return the memory of a filter without measurements."""
     history = tuple(SideHistory() for _ in context.directions)
-    # Without odometry the ego vehicle drives straight on, and corners that are known in metres come nearer.
+    # Without odometry the ego vehicle drives straight ahead; corners with known positions come nearer.
     ego = corrected(None, Odometry("context", start_ns, speed)) if (speed := context.ego_speed_mps) else None
     return Memory(start_ns, StreetBelief.expected(context, settings.street), history, ego=ego)

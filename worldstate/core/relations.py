@@ -1,4 +1,4 @@
-"""Relations of entities to occluders, to the ego vehicle and to one another, and since when they hold."""
+"""Relations of entities to occluders, to the ego vehicle and to one another, with their intervals."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,18 +19,18 @@ from .memory import Memory
 from .site_model import FilterModel
 from .street_belief import StreetBelief
 
-_HOLDS = 0.5  # The probability from which on a relation is said to hold
-_KEPT_NS = nanoseconds(LONGEST_S)  # Of a relation that has ended
-# Half the width of a lane in town; below a walk the heading does not tell the lane.
+_HOLDS = 0.5  # A relation holds from this probability
+_KEPT_NS = nanoseconds(LONGEST_S)  # How long an ended relation is kept
+# Half the width of a lane in town; below walking pace the heading does not indicate the lane.
 _HALF_LANE_M, _LEAST_SPEED_MPS = 1.6, 1.5
 _ALIKE = 0.5  # Cosine of headings in one lane: within 60 degrees
-_LEAST = 0.05  # What is less likely is not named
-Edge: TypeAlias = tuple[str, str, str, float]  # From what to what, its kind, and P(it holds)
+_LEAST = 0.05  # Less likely relations are left out
+Edge: TypeAlias = tuple[str, str, str, float]  # Source, target, kind and P(it holds)
 
 
 def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Relation, ...]:
-    """Return the relations of some tracks, with the interval in which each has held by those in memory."""
-    # What a camera alone has found, first in view, has none.
+    """Return the relations of some tracks, with the interval in which each has held."""
+    # An entity that only a camera has found, and that was first in view, has none.
     related = ~tracks.seen | (tracks.came_from >= _LEAST) | tracks.approach_heard | tracks.placed
     related |= tracks.behind >= _LEAST
     if not memory.relations and True not in related:
@@ -51,7 +51,7 @@ def relations_at(memory: Memory, tracks: Tracks, model: FilterModel) -> tuple[Re
 
 
 def _held(edge: Relation, before: Relation | None) -> Relation:
-    """Return a relation with the interval in which it has held; the last one is kept for five seconds."""
+    """Return a relation with the interval in which it has held; an ended one is kept for five seconds."""
     before = before or edge
     if edge.probability >= _HOLDS:
         begins = before.since_ns is None or before.until_ns is not None
@@ -62,7 +62,6 @@ def _held(edge: Relation, before: Relation | None) -> Relation:
 
 
 def _edges(track: Track, belief: StreetBelief, model: FilterModel) -> Iterator[Edge]:
-    """Yield the relations of one entity to its occluder and to the ego vehicle."""
     occluders = model.context.occluders
     if not track.seen:
         for k, weight in enumerate(side_weights(track, len(occluders))):
@@ -78,7 +77,7 @@ def _edges(track: Track, belief: StreetBelief, model: FilterModel) -> Iterator[E
 
 
 def _hiding(tracks: Tracks, model: FilterModel) -> Iterator[Edge]:
-    """Yield which corners and entities hide those that were in view before."""
+    """Yield the corners and entities that now hide an entity which was in view before."""
     rows = (tracks.seen & (tracks.behind >= _LEAST)).nonzero()[0]
     if len(rows):
         names = [*(one.id for one in model.context.occluders), *tracks.id]
@@ -89,7 +88,7 @@ def _hiding(tracks: Tracks, model: FilterModel) -> Iterator[Edge]:
 
 
 def _comes(track: Track, side: int, belief: StreetBelief, model: FilterModel) -> float:
-    """Return P(it comes into view from there within five seconds | hidden), by its place or the sound."""
+    """Return P(it comes into view there within five seconds | hidden), from its position or the sound."""
     if track.place is not None:
         return float(time_to_visible(track.place, model.site.sides[side], model.site, LONGEST_S)[0])
     coming = belief.coming[side]
@@ -98,7 +97,7 @@ def _comes(track: Track, side: int, belief: StreetBelief, model: FilterModel) ->
 
 
 def _between(tracks: Sequence[Track], context: Context) -> Iterator[Edge]:
-    r"""Yield which entity is next ahead of which in a lane, and which will cross the path of the ego vehicle.
+    r"""Yield which entity is next ahead of another one in a lane, and which will cross the ego's path.
 
     With the heading u of b, its normal n and the offset d from b to a,
 
@@ -120,7 +119,7 @@ def _between(tracks: Sequence[Track], context: Context) -> Iterator[Edge]:
     alike = moves[None] & ((heading @ heading.T >= _ALIKE) | ~moves[:, None])
     beside = np.maximum(np.abs(across) - _HALF_LANE_M, 0.0)
     near = alike & (beside <= 2.0 * np.sqrt(across_var)) & (along > 0.0)
-    # Only the next one ahead: of twenty entities there are 380 pairs.
+    # Only the next entity ahead, because twenty entities have 380 pairs.
     farness = np.where(near, along, np.inf)[:-1]
     for b in np.flatnonzero(np.isfinite(farness).any(axis=0)).tolist():
         a = int(np.argmin(farness[:, b]))
@@ -137,7 +136,7 @@ def _between(tracks: Sequence[Track], context: Context) -> Iterator[Edge]:
 def _crosses(track: Track, ego_speed_mps: float) -> float:
     r"""Return the probability that an entity is on the path ahead of the ego vehicle within five seconds.
 
-    It crosses y = 0 after :math:`t = -y / v_y` at :math:`x + (v_x - u) t`, each to first order normal.
+    It crosses y = 0 after :math:`t = -y / v_y` at :math:`x + (v_x - u) t`; both are normal to first order.
     """
     assert track.place is not None
     (x, y, vx, vy), covariance = track.place.mean.tolist(), track.place.covariance
@@ -149,6 +148,6 @@ def _crosses(track: Track, ego_speed_mps: float) -> float:
     )
     (time_var, _), (_, ahead_var) = (slopes @ covariance @ slopes.T).tolist()
     soon = normal_share((LONGEST_S - time_s) / math.sqrt(time_var))
-    # An entity that may as well stand still or turn away has a deviation of its speed as large as that.
+    # The speed of an entity that may also stand still or turn away has a deviation as large as itself.
     comes = normal_share(abs(vy) / math.sqrt(covariance[-1, -1]))
     return soon * comes * normal_share((x + closing * time_s) / math.sqrt(ahead_var))

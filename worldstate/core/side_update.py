@@ -1,4 +1,4 @@
-"""Update the belief of the sides, and how well a source can hear beside what is in view."""
+"""Update of the belief over the sides, and the audibility of vehicles beside one in view."""
 
 from collections.abc import Iterable
 
@@ -13,38 +13,38 @@ from .memory import NEWS_HOLDS_NS, Memory
 from .site_model import FilterModel
 from .street_belief import informed
 
-_JUST_LEFT_NS = 2 * NEWS_HOLDS_NS  # What has left the view is as loud as it was for so long
+_JUST_LEFT_NS = 2 * NEWS_HOLDS_NS  # A vehicle that has left the view is as loud as before for this long
 
 
 def heard_beside(memory: Memory, measurement: Measurement, street: StreetModel) -> Heard:
-    r"""Return how well could be heard beside a vehicle in view, or one that has just left it.
+    r"""Return the audibility of hidden vehicles beside a vehicle that is in view or has just left it.
 
     .. math:: s = 1 - P(\text{in view})\, \big(1 - P(\text{noticed} \mid \text{level})\big)
 
-    The belief moves by the sequence's own reading, which was learned where vehicles mask one another.
+    It is only published. The belief uses the sequence model, which was trained on vehicles that mask others.
     """
     heard, tracks = measurement.heard, memory.tracks
     near = tracks.moving & (tracks.last_seen_ns >= measurement.stamp_ns - _JUST_LEFT_NS)
     in_view = max(tracks.existence[near].tolist(), default=0.0)
     if memory.belief.has_times:
         in_view = max(in_view, memory.belief.in_view)
-    # P(a vehicle that comes into view within three seconds adds a decibel or more to 300 Hz to 2 kHz); with
-    # none in view it is 0.8 from 3 dB on.
+    # P(a vehicle that comes into view within three seconds adds at least 1 dB from 300 Hz to 2 kHz); without
+    # a vehicle in view it is 0.8 from 3 dB on.
     quiet = falling(heard.excess_db, (street.excess_low_db, street.excess_high_db))
     share = 1.0 - in_view * (1.0 - 0.5 * quiet)
-    # A vehicle that is hardly in view is no reason.
+    # A vehicle that is probably not in view is no reason.
     if in_view < 0.5 or share >= heard.share:
         return heard
-    # What masks is heard itself: the ear is not deaf.
+    # The masking source itself is audible, so the share is not set below `LEAST_HEARD`.
     return replaced(heard, share=max(share, LEAST_HEARD), reason=MASKED)
 
 
 def update_belief(
     memory: Memory, measurement: Measurement, looks: Iterable[CameraLook], model: FilterModel
 ) -> None:
-    """Update the belief of the sides with the evidence of a measurement and with all that cameras saw."""
+    """Update the belief over the sides with the evidence and the looks of a measurement."""
     said, site, memory.last.predicted = measurement.sequence, model.site, memory.belief.joint.explanations
     seen = [site.in_sight(one) for one in looks if not isinstance(one.look.answer, Unqueried)]
     memory.belief = informed(memory.belief, measurement, seen, model.context, model.policy, site.settings)
-    if said is not None:  # Of other sources the last one holds
+    if said is not None:  # Other sources leave it unchanged
         memory.last.no_sequence = said if isinstance(said, NotUsable) else None

@@ -1,4 +1,4 @@
-"""What the filter knows of the place: the context as the ego vehicle has it, and the belief with it."""
+"""Site model of the filter: the context as seen from the ego vehicle's present pose."""
 
 import math
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ class FilterModel:
     context: Context
     policy: CueingPolicy
     site: SiteGeometry
-    reads_sound: bool = True  # Whether a model tells what is heard
+    reads_sound: bool = True  # Whether a model interprets the sound
 
 
 def site_geometry_of(
     context: Context, settings: FilterSettings, ego: EgoBelief | None = None
 ) -> SiteGeometry:
-    """Return the site geometry of a context, as the ego vehicle has it."""
+    """Return the site geometry of a context, as seen from the ego vehicle."""
     x, y, yaw_rad = (0.0, 0.0, 0.0) if ego is None else ego.pose.tolist()
     sides = (
         SideGeometry(
@@ -51,7 +51,7 @@ def site_geometry_of(
 
 
 def from_here(model: FilterModel, ego: EgoBelief | None) -> FilterModel:
-    """Return the model as the ego vehicle has it where it is now; without odometry, as the context says."""
+    """Return the model as seen from the ego vehicle's present pose; without odometry, the model itself."""
     if ego is None:
         return model
     x_var, y_var, yaw_var = ego.covariance.diagonal().tolist()
@@ -63,7 +63,7 @@ def from_here(model: FilterModel, ego: EgoBelief | None) -> FilterModel:
 
 
 def without_open_sides(measurement: Measurement, context: Context) -> Measurement:
-    """Remove the evidence of a window for hidden vehicles on sides without an occluder."""
+    """Remove a window's evidence for vehicles hidden on sides without an occluder."""
     if all(one.hides for one in context.occluders):
         return measurement
     is_open = {one.direction for one in context.occluders if not one.hides}

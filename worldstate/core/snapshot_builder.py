@@ -38,19 +38,19 @@ from .birth_death import HIDDEN
 from .memory import NEWS_HOLDS_NS, CountedLook, Memory
 from .street_belief import StreetBelief
 
-# Of what is published: numbers in full precision take twice as long to write.
+# Decimals of published numbers; full precision takes twice as long to write.
 _DIGITS, _SHORT = 9, 6
-# Beyond two seconds vehicles at junctions have turned or braked.
+# Forecasts end at two seconds, because vehicles at junctions turn or brake by then.
 _AFTER_S = np.array([1.0, 2.0])
 _CUBES = np.array([white_acceleration(after_s)[0, 0] for after_s in _AFTER_S])
 _SOONER, _LATER = (f"{after_s:g}" for after_s in _AFTER_S)
 Forecast: TypeAlias = dict[str, tuple[float, float]]
-# Mean and deviations of a track's motion, covariance of azimuth and rate, forecast, as Python numbers.
+# Means and deviations of a track's motion, covariance of azimuth and rate, forecast, as Python numbers.
 _Moments: TypeAlias = tuple[list[float], list[float], list[float], Forecast]
 
 
 def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
-    r"""Return where entities will be, one forecast a track: constant velocity, all of them at once.
+    r"""Return the forecast of every track at constant velocity, for all tracks at once.
 
     With the state :math:`(\theta, \dot\theta, \rho, \log r)` and its covariance P, after t seconds
 
@@ -62,7 +62,7 @@ def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
     """
     theta, omega, rho, log_range = tracks.mean.T[:, :, None]
     a, b = 1.0 + rho * _AFTER_S, omega * _AFTER_S
-    # At the array itself, q = 0, the coordinates are singular; this is 1 % of the first range.
+    # At the array itself, q = 0, the coordinates are singular; the limit is 1 % of the first range.
     q = np.maximum(a * a + b * b, LEAST_STD)
     gradient = np.array([np.ones(a.shape), a * _AFTER_S / q, -b * _AFTER_S / q]).transpose(1, 2, 0)
     known = np.add.reduce(gradient @ tracks.covariance[:, :LOG_RANGE, :LOG_RANGE] * gradient, -1)
@@ -71,13 +71,14 @@ def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
     variance = known + density[:, None] * _CUBES / (range_m**2 * q)
     azimuth_rad = theta + np.arctan2(b, a)
     azimuth_rad -= math.tau * np.round(azimuth_rad / math.tau)
-    # Full precision would take twice as long to write.
+    # Full precision takes twice as long to write.
     means = np.minimum(np.maximum(azimuth_rad.round(_SHORT), -np.pi), np.pi).tolist()
     pairs = zip(means, np.sqrt(variance).round(_SHORT).tolist(), strict=True)
     return [{_SOONER: (at[0], std[0]), _LATER: (at[1], std[1])} for at, std in pairs]
 
 
-# Of log r: 25 % of the range. The priors have .6, so a range with more was assumed and never measured.
+# Deviation of log r, 25 % of the range. The priors have 0.6; a range with a larger deviation was not
+# measured.
 _KNOWN_LOG_RANGE_STD = 0.25
 NINE_OF_TEN = NormalDist().inv_cdf(1.0 - TAIL)  # Standard deviations to either side
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
@@ -85,7 +86,7 @@ _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
 
 def entities_of(tracks: Tracks, memory: Memory, site: SiteGeometry) -> tuple[Entity, ...]:
     """Return some tracks as published entities."""
-    # All at once: a number taken out of an array by itself costs as much as a row.
+    # All at once: to read a single number from an array takes as long as to read a row.
     stds = np.sqrt(tracks.covariance.diagonal(axis1=1, axis2=2))
     lists = [array.round(_DIGITS).tolist() for array in (tracks.mean, stds, tracks.covariance[:, *_UPPER])]
     moments = zip(*lists, forecasts(tracks, site), strict=True)
@@ -96,12 +97,12 @@ def _entity(belief: StreetBelief, site: SiteGeometry, track: Track, moments: _Mo
     mean, std, (variance, mixed, rate_variance), forecast = moments
     existence, hidden, side = track.existence, track.behind >= HIDDEN, site.sides[track.side]
     if hidden and track.place is not None and not track.seen:
-        # Not combined: what is believed of the side may rest on the same messages.
+        # The maximum, not a combination: the belief over the side may include the same messages.
         existence = max(existence, belief.sides.hidden[track.side])
     heard_only = hidden and not track.detected
     range_m = None if heard_only or std[LOG_RANGE] >= _KNOWN_LOG_RANGE_STD else math.exp(mean[LOG_RANGE])
     closing_hz = -mean[RADIAL_RATE] if track.approach_heard else None
-    # Rounded up, what stands right behind would be beyond a half turn.
+    # Rounding could move an azimuth directly behind the ego vehicle beyond pi.
     azimuth_rad, std_rad = min(max(mean[AZIMUTH], -math.pi), math.pi), std[AZIMUTH]
     source: AzimuthSource = "measured" if track.detected else _rests_on(track.motion, side)
     if heard_only:
@@ -136,7 +137,7 @@ def _entity(belief: StreetBelief, site: SiteGeometry, track: Track, moments: _Mo
 
 
 def sound_entities(tracks: Iterable[SoundTrack], settings: FilterSettings) -> tuple[Entity, ...]:
-    """Return what likely sounds as entities, of which only that and the azimuth is stated."""
+    """Return likely tracks of sound as entities with only an existence and an azimuth."""
     likely = (one for one in tracks if one.existence >= settings.street.birth)
     return tuple(
         Entity(
@@ -156,14 +157,14 @@ def sound_entities(tracks: Iterable[SoundTrack], settings: FilterSettings) -> tu
 
 
 def _classes(track: Track) -> tuple[Classification, ...]:
-    """Return the class probabilities of a track; what no label has is unknown, so that they sum to one."""
+    """Return the class probabilities of a track; the rest is unknown, so that they sum to one."""
     classes = [Classification(label, share) for label, share in track.labels if label != UNKNOWN]
     rest = round(1.0 - sum([one.probability for one in classes]), _DIGITS)
     return (*classes, Classification(UNKNOWN, rest)) if rest > 0.0 else tuple(classes)
 
 
 def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
-    """Return the sector that holds nine of ten, from its right end to its left one."""
+    """Return the 90 % sector around an azimuth, from its right end to its left end."""
     half_rad = NINE_OF_TEN * std_rad
     if half_rad >= math.pi:
         return -math.pi, math.pi
@@ -172,16 +173,16 @@ def sector(azimuth_rad: float, std_rad: float) -> tuple[float, float]:
 
 
 def time_to_arrival(closing_hz: float | None, std_hz: float) -> float | None:
-    """Return TTA in seconds where a measured approach rate exceeds its standard deviation, else None."""
+    """Return the time to arrival in seconds if the approach rate exceeds its deviation, else None."""
     return 1.0 / closing_hz if closing_hz is not None and closing_hz > std_hz else None
 
 
 def hidden_azimuth(
     side: int, track: Track | None, belief: StreetBelief, site: SiteGeometry
 ) -> tuple[float, float, AzimuthSource]:
-    """Return where a hidden vehicle is, how far that may be off, and what it rests on.
+    """Return azimuth, standard deviation and source of a hidden vehicle.
 
-    By its place, its time to visible, or as heard.
+    The source is its position, its time to visible, or a bearing.
     """
     if track is not None and track.place is not None:
         return track.motion.azimuth_rad, track.motion.azimuth_std_rad, "measured"
@@ -189,18 +190,18 @@ def hidden_azimuth(
         return *hidden_bearing(belief.coming[side], site.sides[side]), "context"
     corner = site.sides[side]
     motion = track.motion if track is not None and track.side == side else corner.prior()
-    # Sound round a corner comes from its edge, not from the vehicle, which averaging over hops leaves.
+    # Sound round a corner comes from the edge, not from the vehicle; an average over hops keeps this bias.
     std_rad = math.hypot(motion.azimuth_std_rad, corner.bias_std_rad)
     return motion.azimuth_rad, std_rad, _rests_on(motion, corner)
 
 
 def _rests_on(motion: MotionBelief, side: SideGeometry) -> AzimuthSource:
-    """Return what an azimuth rests on: bearings where they hold more of what is known than the context."""
+    """Return the source of an azimuth: bearings if they at least halve the context's variance."""
     return "measured" if 2.0 * motion.azimuth_std_rad**2 <= side.std_rad**2 else "context"
 
 
 def _side_shares(track: Track, belief: StreetBelief, site: SiteGeometry) -> tuple[SideShare, ...]:
-    """Return the parts of the azimuth density of an entity that may be on several sides."""
+    """Return the azimuth on each side, for an entity that may be on several sides."""
     shares = [] if track.detected else [(k, share) for k, share in enumerate(track.side_shares) if share]
     return tuple(
         SideShare(site.sides[k].label, round(share, _DIGITS), *hidden_azimuth(k, track, belief, site)[:2])
@@ -210,12 +211,12 @@ def _side_shares(track: Track, belief: StreetBelief, site: SiteGeometry) -> tupl
 
 
 def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
-    """Return position, velocity and covariance where known, and when a hidden one comes into view."""
+    """Return position, velocity and covariance if known, and the time to visible if hidden."""
     place = track.place
     if place is None or place.position_std_m >= site.street.known_m:
         return {}
     x, y, vx, vy = place.mean.tolist()
-    moves = place.velocity_std_mps < site.street.known_m  # A change of pace
+    moves = place.velocity_std_mps < site.street.known_m  # The same limit in m/s
     return {
         "position_m": (x, y, 0.0),
         "velocity_mps": (vx, vy, 0.0) if moves else None,
@@ -225,21 +226,21 @@ def _place(track: Track, hidden: bool, site: SiteGeometry) -> dict[str, Any]:
 
 
 def ego_of(ego: EgoBelief) -> Ego:
-    """Return the ego vehicle as it is published."""
+    """Return the published form of the ego vehicle."""
     x, y, yaw = ego.pose.round(_DIGITS).tolist()
     covariance = tuple(map(tuple, ego.covariance.round(_DIGITS).tolist()))
     return Ego((x, y), yaw, covariance, ego.speed_mps, ego.yaw_rate_rad_s, ego.localised)
 
 
 def sensors_of(memory: Memory) -> tuple[SensorHealth, ...]:
-    """Return how every sensor is that spoke or looked."""
+    """Return the condition of every sensor that has delivered data."""
     last = {name: (look.stamp_ns, _look_fault(look)) for name, look in memory.looks.items()}
     last |= {name: (one.stamp_ns, one.fault) for name, one in memory.sources.items()}
     return tuple(_health(name, *last[name], memory.stamp_ns) for name in sorted(last))
 
 
 def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
-    """Return how well every source that listens could hear; of one that is silent nothing is known."""
+    """Return the audibility of vehicles for each active source; None if no source measures it."""
     listening = [(name, one) for name, one in sorted(memory.sources.items()) if one.heard.measured]
     told = [pair for pair in listening if memory.stamp_ns <= pair[1].stamp_ns + NEWS_HOLDS_NS]
     every = tuple(_hearing(name, one.heard, one.heard_ns) for name, one in told)
@@ -248,7 +249,7 @@ def hearings(memory: Memory) -> tuple[Hearing, ...] | None:
 
 def _hearing(source: str, heard: Heard, since_ns: int) -> Hearing:
     shares = heard.kinds if heard.kinds and heard.usable else {}
-    # Shares of some tens of approaches: to the thousandth.
+    # These shares were measured on some tens of approaches, so three decimals suffice.
     kinds = {kind: round(heard.share * share, 3) for kind, share in shares.items()}
     return Hearing(source, heard.share, since_ns, heard.reason, kinds or None)
 

@@ -1,4 +1,4 @@
-"""One step of the filter: the memory at a later time, and after what was measured then."""
+"""One step of the filter: predict the memory to a later time, and update it with a measurement."""
 
 from collections.abc import Sequence
 
@@ -30,14 +30,15 @@ from .side_update import update_belief
 from .site_model import FilterModel, from_here, without_open_sides
 from .street_belief import carried
 
-# All that two cameras and a radio find at a crowded crossing; a step costs with their square.
+# Two cameras and a radio find fewer at a crowded crossing; the time of a step grows with the square.
 MOST_TRACKS = 128
 
 
 def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
     """Return a draft of the memory, predicted to a later time."""
     before, memory, step_ns = memory, memory.draft(), stamp_ns - memory.stamp_ns
-    # First: what has come into view by then depends on where the edges are by then.
+    # First, because the edges move with the ego vehicle, and they determine which vehicles have come into
+    # view.
     memory.ego = memory.ego and driven(memory.ego, seconds(step_ns))
     model = from_here(model, memory.ego)
     predict_tracks(memory.tracks, seconds(step_ns), model.site)
@@ -53,10 +54,10 @@ def advanced(memory: Memory, stamp_ns: int, model: FilterModel) -> Memory:
 
 
 def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
-    """Update the memory after announced entities have come past their edge, or their place was lost."""
+    """Update the memory after announced entities have passed their edge or have lost their position."""
     tracks, street, emerged, gone = memory.tracks, model.site.street, list[int](), list[int]()
     now = {name: row for row, name in enumerate(tracks.id)}
-    # Without a place it would be a hidden entity by its sound: of a side where nothing is heard it is gone.
+    # Without a position it would become a sound-only entity; on a side without sound it is removed.
     heard = [chance >= street.birth for chance in memory.sides.hidden]
     for old in (before.placed & ~before.seen).nonzero()[0].tolist():
         row, side = now[before.id[old]], int(before.side[old])
@@ -71,7 +72,7 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
 
 
 def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
-    """Update a draft with a measurement of its time; `before` is what it was drafted from."""
+    """Update a draft with a measurement of its time; `before` is the memory before the draft."""
     model = from_here(model, memory.ego)
     stood = _standing(before, memory, model)
     _perceive(memory, measurement, start_ns, model)
@@ -90,16 +91,15 @@ def take_in(before: Memory, memory: Memory, measurement: Timed, start_ns: int, m
 
 
 def _standing(before: Memory, memory: Memory, model: FilterModel) -> list[bool]:
-    """Return on which sides an advisory stands before a measurement counts.
+    """Return which sides have an advisory before a measurement is applied.
 
-    One that had ended when the draft was carried to this time begins anew.
+    An advisory that ended by the time of the draft starts anew.
     """
     stood = [one.advised_ns is not None for one in before.history]
     return [one is not None for one in SideAlarms(memory, model).advisories] if any(stood) else stood
 
 
 def _perceive(memory: Memory, measurement: Timed, start_ns: int, model: FilterModel) -> None:
-    """Update a draft with odometry, with positions, or with what is heard and seen."""
     memory.counts.measurements += 1
     if isinstance(measurement, Odometry):
         _take_odometry(memory, measurement)
@@ -112,7 +112,7 @@ def _perceive(memory: Memory, measurement: Timed, start_ns: int, model: FilterMo
 def _hear_and_look(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
     last, site = memory.sources.get(measurement.source), model.site
     since_ns = measurement.stamp_ns - (start_ns if last is None else last.stamp_ns)
-    # Of windows that overlap, what is new counts.
+    # Windows overlap; only the new part has weight.
     new_s = max(seconds(since_ns), 0.0)
     weight = min(new_s / site.settings.window_s, 1.0)
     measurement, looks = new_looks(memory, measurement, start_ns, site.street)
@@ -128,7 +128,7 @@ def _hear_and_look(memory: Memory, measurement: Measurement, start_ns: int, mode
 
 
 def _take_odometry(memory: Memory, told: Odometry) -> None:
-    """Update a draft with odometry: azimuth rates are those of axes that turn with the ego vehicle."""
+    """Update a draft with odometry; azimuth rates refer to axes that turn with the ego vehicle."""
     before, memory.ego = memory.ego, corrected(memory.ego, told)
     faster = memory.ego.yaw_rate_rad_s - (0.0 if before is None else before.yaw_rate_rad_s)
     if faster:
@@ -137,7 +137,7 @@ def _take_odometry(memory: Memory, told: Odometry) -> None:
 
 
 def _keep_likeliest(memory: Memory) -> None:
-    """Keep the likeliest tracks; boxes and claims do not push out what is only heard."""
+    """Keep the likeliest tracks; boxes and messages do not displace sound-only entities."""
     tracks = memory.tracks
     if len(tracks) > MOST_TRACKS:
         order = np.lexsort((-tracks.existence, tracks.detected))
@@ -146,7 +146,7 @@ def _keep_likeliest(memory: Memory) -> None:
 
 
 def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
-    """Return the sides whose vehicle of before is in view now, from whichever side it came."""
+    """Return the sides whose earlier hidden vehicle is in view now, from whichever side it came."""
     if not hidden_rows(before.tracks):
         return []
     seen = set(memory.tracks.id[memory.tracks.seen])
@@ -155,7 +155,6 @@ def _announced_in_view(before: Memory, memory: Memory) -> list[int]:
 
 
 def _note_advisories(memory: Memory, stood: Sequence[bool], stands: Sequence[bool]) -> None:
-    """Note since when an advisory has been out on each side."""
     for side, was_out, is_out in zip(memory.history, stood, stands, strict=True):
         if not is_out:
             side.advised_ns = None
