@@ -1,1 +1,1 @@
-"""Beliefs of explanations and entities, and their predict and update steps."""
+"""Beliefs over explanations and entities, with their predict and update steps."""

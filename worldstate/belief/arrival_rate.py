@@ -1,4 +1,4 @@
-"""How often vehicles come into view from a side, learned while a camera looks."""
+"""Rate at which vehicles come into view from a side, learned while a camera looks."""
 
 import math
 from dataclasses import dataclass
@@ -10,19 +10,19 @@ from .street_model import StreetModel
 
 @dataclass(frozen=True, slots=True)
 class ArrivalRate:
-    r"""Arrivals from one side, and the time in which they would have been seen: Gamma prior, Poisson count.
+    r"""Arrivals from one side and the time of observation: Gamma prior, Poisson count.
 
     .. math:: \lambda \mid n, T \sim \Gamma\Big(a + n,\ \frac{a}{\lambda_0} + T\Big), \qquad
               \log \frac{E \lambda}{\lambda_0} = \log \frac{a + n}{a + \lambda_0 T}
 
-    with n arrivals in a time T of watching, both forgotten slowly, and the usual rate :math:`\lambda_0`.
+    with n arrivals in an observed time T, both slowly forgotten, and the usual rate :math:`\lambda_0`.
     """
 
     count: float = 0.0
     watched_s: float = 0.0
 
     def watched_for(self, step_s: float, street: StreetModel) -> "ArrivalRate":
-        """Return the rate after a time watched."""
+        """Return the rate after more observed time."""
         kept = math.exp(-step_s / street.traffic_s)
         return ArrivalRate(self.count * kept, self.watched_s * kept + step_s)
 
@@ -31,7 +31,7 @@ class ArrivalRate:
         return replaced(self, count=self.count + 1.0)
 
     def shift_nats(self, usual_hz: float, street: StreetModel) -> float:
-        """Return by how much the log-odds of a vehicle coming differ from usual, in steps of .1 nats.
+        """Return how far the log-odds of an arrival differ from the usual ones, in steps of 0.1 nats.
 
         Examples
         --------
@@ -41,5 +41,5 @@ class ArrivalRate:
         """
         like = street.traffic_like
         nats = math.log((like + self.count) / (like + usual_hz * self.watched_s))
-        # The chain is computed anew for every prior: a few are enough.
+        # The chain is computed for every new prior; rounding keeps the number of priors small.
         return round(min(max(nats, -street.traffic_nats), street.traffic_nats), 1)

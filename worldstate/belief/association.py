@@ -1,4 +1,4 @@
-"""Association of detections with entities, in view and at the edge of an occluder, all at once."""
+"""Joint association of detections with entities in view and with hidden ones at the edge of an occluder."""
 
 import math
 from collections.abc import Sequence
@@ -18,55 +18,56 @@ from .site_geometry import SiteGeometry, normal_share
 from .street_model import StreetModel
 from .track import Track, Tracks, side_weights
 
-# Of a pair outside the gate; below any sum of scores within it.
+# Score of a pair outside the gate; below any sum of scores within it.
 FORBIDDEN = -MOST_NATS
-# Of a table of events and pairs: all of five tracks and five measurements, or of three and twelve.
+# Size limit of a table of events and pairs: five tracks and five measurements fit, or three and twelve.
 _MOST_ENTRIES = 100_000
-_ROUNDS = 30  # After these messages of twenty tracks that stand abreast change by less than 1e-3
-# Of the squared Mahalanobis distance of a bearing or a position: 0.9997 of chi-square with four degrees of
-# freedom.
+_ROUNDS = 30  # Messages among twenty tracks side by side then change by less than 1e-3
+# Gate on the squared Mahalanobis distance of a bearing or a position: 0.9997 of chi-square with four degrees
+# of freedom.
 GATE = 21.0
-# As detectors call them. What was heard drives: a detector has misread its label, or the ear the kind.
+# Detector labels. An audible entity is a vehicle; any other label is an error of detector or sound
+# classifier.
 _VEHICLES = frozenset().union(*SEEN_AS.values())
 _ON_FOOT = frozenset({"person", "pedestrian"})
 
 
 @dataclass(frozen=True, slots=True)
 class Association:
-    """Whose detections are: the likeliest assignment, and the probability of every pair."""
+    """The likeliest assignment of detections to tracks, and the probability of every pair."""
 
-    found: dict[int, int]  # Detection of a track
-    pairs: FloatArray  # P(a detection is a track's) over all joint events, shape (detections, tracks)
-    new: list[int]  # Detections of no track
+    found: dict[int, int]  # Detection by track
+    pairs: FloatArray  # P(a detection belongs to a track) over all joint events, shape (detections, tracks)
+    new: list[int]  # Detections without a track
 
     @property
     def unclaimed(self) -> FloatArray:
-        """P(it is of no track) of every detection."""
+        """P(it belongs to no track) for every detection."""
         return np.asarray(np.maximum(1.0 - self.pairs.sum(axis=1), 0.0))
 
     @property
     def chances(self) -> list[float]:
-        """P(one of them is its) of every track."""
+        """P(it has been detected) for every track."""
         chances: list[float] = np.minimum(self.pairs.sum(axis=0), 1.0).tolist()
         return chances
 
 
 def associated(tracks: Tracks, detections: Detections, site: SiteGeometry) -> Association:
-    r"""Return whose the detections of an instant are, all boxes or all positions.
+    r"""Return the association of the detections of an instant, all boxes or all positions.
 
-    Every one is of an entity that was detected before, of a hidden one that comes past an edge, or of an
-    object that was not known; how much likelier than that, nats, they are one of
+    A detection belongs to an entity that was detected before, to a hidden one that comes past an edge, or to
+    a new object. The log ratios of the first two to the third, nats, are
 
     .. math:: \log \frac{r\, p_D\, N(z; H m, H P H^T + R)}{(1 - r p_D)\, u}, \qquad
               \log \frac{r}{u} [(1 - c)\, N(z; a_k, \sigma^2) + c \max_j N(z; a_j, \sigma^2)]
 
-    with existence r, of a hidden one times the chance that it stands near its edge by now, the edge a of its
-    side, which the signature may have confused with probability c, and the density u of objects that were
-    not known. Entities in view and hidden ones compete: an entity that has left the view would else take
-    the first detection of the next one.
+    with the existence r, for a hidden entity times the chance that it has reached its edge; the edge a of its
+    side, which the signature may have confused with probability c; and the density u of new objects. Entities
+    in view compete with hidden ones, because an entity that has left the view would otherwise take the first
+    detection of the next one.
     """
     detected = tracks.detected
-    # A radar also finds some of what is hidden.
+    # A radar also detects some hidden entities.
     unseen = 1.0 - (site.street.hidden_return if detections.positions else 0.0)
     in_sight = detected * (1.0 - tracks.behind * (unseen if detections.in_sight else 0.0))
     if not len(tracks) or not len(detections):
@@ -75,13 +76,13 @@ def associated(tracks: Tracks, detections: Detections, site: SiteGeometry) -> As
 
 
 def joint_association(log_ratios: FloatArray, in_sight: FloatArray | BoolArray) -> Association:
-    """Return the association of detections and tracks by how much likelier than new each pair is.
+    """Return the association, given the log ratio of every pair to a new object.
 
     Shapes: log_ratios (detections, tracks), FORBIDDEN outside the gate; in_sight (tracks,), P(in line of
-    sight) of what was detected before, 0 of what was not.
+    sight) of entities that were detected before, 0 for others.
     """
-    # Within its gate an entity in view takes a measurement before that counts as a new one; a maximum of
-    # the two would be a tie of all poor pairs, which the order of measurements would settle.
+    # Within its gate an entity in view has precedence over a new object. With a maximum of the two scores all
+    # poor pairs would be equal, and the order of measurements would have an effect.
     gated = log_ratios > FORBIDDEN
     scores = np.where(gated, np.logaddexp(log_ratios, np.log(np.maximum(in_sight, TINY))), log_ratios)
     found = _likeliest(scores)
@@ -91,12 +92,12 @@ def joint_association(log_ratios: FloatArray, in_sight: FloatArray | BoolArray) 
 
 
 def association_probabilities(log_ratios: FloatArray) -> FloatArray:
-    r"""Return P(measurement j is track i's), shape (measurements, tracks), over all joint events.
+    r"""Return P(measurement j belongs to track i), shape (measurements, tracks), over all joint events.
 
     .. math:: p_{ij} = \sum_{a:\, a(i) = j} p(a), \qquad p(a) \propto \prod_i e^{l_{i a(i)}}
 
-    An event gives every track one measurement or none, and no measurement to two. For groups of tracks that
-    share measurements in some 2,000 events and more the sum is approximated by belief propagation.
+    In an event every track has at most one measurement, and every measurement at most one track. For groups
+    of tracks with more than about 2,000 events the sum is approximated by belief propagation.
 
     Examples
     --------
@@ -104,7 +105,7 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
     array([[0.6, 0.2]])
     """
     gated, chances = log_ratios > FORBIDDEN, np.zeros_like(log_ratios)
-    # Pairs that compete with no other, which most are, all at once.
+    # Pairs without competitors, which are the majority, all at once.
     alone = gated & (gated.sum(axis=0) == 1) & (gated.sum(axis=1) == 1)[:, None]
     chances[alone] = np.exp(-np.logaddexp(0.0, -log_ratios[alone]))
     crowd = gated & ~alone
@@ -123,13 +124,13 @@ def association_probabilities(log_ratios: FloatArray) -> FloatArray:
 
 
 def propagated(log_ratios: FloatArray) -> FloatArray:
-    r"""Return P(measurement j is track i's) by belief propagation, shape (measurements, tracks).
+    r"""Return P(measurement j belongs to track i) by belief propagation, shape (measurements, tracks).
 
     .. math:: \mu_{ij} = \frac{e^{l_{ij}}}{1 + \sum_{j' \ne j} e^{l_{ij'}} \nu_{j'i}}, \qquad
               \nu_{ji} = \frac{1}{1 + \sum_{i' \ne i} \mu_{i'j}}
 
     Source: J. Williams, R. Lau, "Approximate evaluation of marginal association probabilities with belief
-    propagation", IEEE Trans. Aerosp. Electron. Syst. 50, 2014, where it is proved to converge.
+    propagation", IEEE Trans. Aerosp. Electron. Syst. 50, 2014, with a proof of convergence.
 
     Examples
     --------
@@ -142,7 +143,7 @@ def propagated(log_ratios: FloatArray) -> FloatArray:
         given = weight * free
         wanted = weight / (1.0 + given.sum(axis=0) - given)
         before, free = free, 1.0 / (1.0 + wanted.sum(axis=1, keepdims=True) - wanted)
-        # Of tracks that stand apart four rounds are enough.
+        # Four rounds are enough for tracks that are far apart.
         if np.abs(free - before).max() < TINY:
             break
     given = weight * free
@@ -150,9 +151,9 @@ def propagated(log_ratios: FloatArray) -> FloatArray:
 
 
 def _groups(gated: BoolArray) -> list[tuple[list[int], list[int]]]:
-    """Return rows and columns of every group that shares no pair with another one."""
+    """Return rows and columns of all groups; no pair belongs to two groups."""
     groups: list[tuple[int, list[int]]] = []
-    # Rows as the bits of a number: two columns share one where their numbers have a bit in common.
+    # Rows as the bits of a number: two columns share a row if their numbers have a common bit.
     for column, bits in enumerate(np.packbits(gated, axis=0, bitorder="little").T):
         rows, columns = int.from_bytes(bits.tobytes(), "little"), [column]
         for group in [one for one in groups if rows & one[0]]:
@@ -165,7 +166,7 @@ def _groups(gated: BoolArray) -> list[tuple[list[int], list[int]]]:
 
 @lru_cache
 def _joint_events(rows: int, columns: int) -> FloatArray | None:
-    """Return whether a joint event has a pair, shape (rows * columns, events); None of too many."""
+    """Return whether each joint event contains a pair, shape (rows * columns, events); None if too many."""
     events: list[tuple[int, ...]] = [()]
     for _ in range(columns):
         events = [(*one, row) for one in events for row in range(rows + 1) if row == rows or row not in one]
@@ -175,17 +176,17 @@ def _joint_events(rows: int, columns: int) -> FloatArray | None:
 
 
 def _likeliest(scores: FloatArray) -> dict[int, int]:
-    """Return {column: row} of the largest sum of scores, where every row may be a new entity instead, at 0.
+    """Return {column: row} with the largest sum of scores; a row without a column is a new entity, score 0.
 
     Examples
     --------
     >>> _likeliest(np.array([[4.0, 3.0], [3.5, FORBIDDEN]]))
     {1: 0, 0: 1}
     """
-    # Imported where it is needed: scipy.optimize takes longer than all else that the core imports.
+    # Imported here: scipy.optimize takes longer than everything else that the core imports.
     from scipy.optimize import linear_sum_assignment
 
-    # A row without a partner that is worth more takes one that is worth nothing.
+    # A row without a useful partner gets one with a score of zero.
     rows, columns = linear_sum_assignment(np.maximum(scores, 0.0), maximize=True)
     worth = scores[rows, columns] > 0.0
     return dict(zip(columns[worth].tolist(), rows[worth].tolist(), strict=True))
@@ -194,7 +195,7 @@ def _likeliest(scores: FloatArray) -> dict[int, int]:
 def _log_ratios(
     tracks: Tracks, detected: BoolArray, in_sight: FloatArray, detections: Detections, site: SiteGeometry
 ) -> FloatArray:
-    """Return how much likelier than a new object every pair is, nats, shape (detections, tracks)."""
+    """Return the log ratio of every pair to a new object, nats, shape (detections, tracks)."""
     boxes, found = not detections.positions, detections.found[:, None]
     existence = np.minimum(np.maximum(tracks.existence, site.street.doubt), 1.0 - site.street.doubt)
     if detections.in_sight:
@@ -202,7 +203,7 @@ def _log_ratios(
     likely = np.log(existence * np.where(found > 0.0, found, 1.0)) - np.log1p(-existence * found)
     density = _azimuth_density(tracks, detected, detections, site)
     if detections.in_sight and not detected.all():
-        # What was only heard is found where it comes into view.
+        # Sound-only entities are detected at the edge where they come into view.
         heard = (~detected).nonzero()[0]
         hidden = tracks.taken(heard).rows()
         density[:, heard] = np.log(np.maximum(emergence_density(hidden, detections, site), TINY))
@@ -219,9 +220,9 @@ def _log_ratios(
 def _azimuth_density(
     tracks: Tracks, detected: BoolArray, detections: Detections, site: SiteGeometry
 ) -> FloatArray:
-    """Return the log density of every detection's azimuth, 1/rad, FORBIDDEN outside the gate of a box."""
+    """Return the log density of every detection's azimuth, 1/rad, FORBIDDEN outside the gate."""
     residual = wrap_angle(detections.azimuth_rad[:, None] - tracks.mean[:, AZIMUTH])
-    # The sound of a hidden one may come from the edge instead.
+    # The sound of a hidden entity may come from the edge instead.
     biases_rad = np.array([side.bias_std_rad for side in site.sides])
     own = tracks.covariance[:, AZIMUTH, AZIMUTH] + ~detected * biases_rad[tracks.side] ** 2
     variance = own + detections.std_rad[:, None] ** 2
@@ -232,9 +233,9 @@ def _azimuth_density(
 
 
 def _alike(tracks: Tracks, detected: BoolArray, detections: Detections, site: SiteGeometry) -> FloatArray:
-    """Return what motion, width and class say of every pair of a box and a track, nats."""
+    """Return the log ratio of motion, width and class for every pair of a box and a track, nats."""
     moving = detections.moving[:, None] > 0.0
-    # A parked car that drives off keeps its identity, unless a moving object is as near.
+    # A parked car that drives off keeps its identity, unless a moving object is equally near.
     alike = np.where(moving == tracks.moving, 0.0, math.log(site.street.doubt))
     known = (detections.width_rad[:, None] > 0.0) & (tracks.width_rad > 0.0) & detected
     logs = [np.log(np.where(one > 0.0, one, 1.0)) for one in (detections.width_rad, tracks.width_rad)]
@@ -254,8 +255,8 @@ def _density_m2(
 ) -> FloatArray:
     """Return the log density of every position, 1/m^2, FORBIDDEN outside the gate.
 
-    The velocity enters by how much likelier it is than that of another, so that an entity without a place is
-    scored in the same units, by its azimuth and log range.
+    The velocity enters as a ratio to the density of an unknown velocity. An entity without a position then
+    has a score in the same unit, from its azimuth and log range.
     """
     measured = [full_measurement(one, LARGEST_STD) for one in detections.positions]
     z, noise = np.array([one[0] for one in measured]), np.array([one[1] for one in measured])
@@ -278,13 +279,13 @@ def _density_m2(
 
 
 def _log_normal(residual: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return squared Mahalanobis distance and log density of residuals, shape (..., n) both without n."""
+    """Return squared Mahalanobis distance and log density of residuals, without their last axis."""
     distance = np.einsum("...k,...k->...", residual, np.linalg.solve(spread, residual[..., None])[..., 0])
     return distance, -0.5 * (distance + np.linalg.slogdet(2.0 * math.pi * spread)[1])
 
 
 def _shared_class(labels: ClassShares, label: str, misread: float) -> float:
-    """Return P(a detector calls what sounds like some classes by this label)."""
+    """Return P(a detector uses this label | the sound classes of the entity)."""
     if label not in _VEHICLES:
         return misread if label in _ON_FOOT else 1.0
     kinds = ((kind == label or label in SEEN_AS.get(kind, _VEHICLES), share) for kind, share in labels)
@@ -292,9 +293,9 @@ def _shared_class(labels: ClassShares, label: str, misread: float) -> float:
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:
-    """Return how likely a hidden entity is near enough to its edge, against one of unknown time.
+    """Return how likely a hidden entity has reached its edge, relative to one of unknown time.
 
-    A vehicle believed seconds away from the edge is not the one that appears now.
+    A vehicle that is believed seconds away from the edge is not the one that appears now.
     """
     side, near_rad = site.sides[track.side], site.street.edge_std_rad
 
@@ -311,7 +312,7 @@ def emergence_density(tracks: Sequence[Track], detections: Detections, site: Sit
     azimuth_rad, widths_rad = detections.azimuth_rad, np.nan_to_num(detections.width_rad)
     from_edge_rad = np.stack([side.distance_rad(azimuth_rad, widths_rad) for side in site.sides], axis=1)
     spread_rad, confused = site.street.edge_std_rad, site.street.side_confusion
-    # Of first sightings about the edge that they come past, 1/rad.
+    # Density of first sightings around each edge, 1/rad.
     near = np.exp(-0.5 * (from_edge_rad / spread_rad) ** 2) / (spread_rad * math.sqrt(2.0 * math.pi))
     heard = np.empty_like(near)
     for side in range(len(site.sides)):

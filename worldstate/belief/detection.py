@@ -1,4 +1,4 @@
-"""Detections: what a box, a position or a message measures of one object, and the look that has found it."""
+"""Detections: boxes, positions and messages, and the looks that contain them."""
 
 import math
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from worldstate.measurement.position import Position, PositionScan
 from .site_geometry import SiteGeometry
 from .street_model import StreetModel
 
-# m/s: slower is parked, as far as a radar or a positioning receiver can tell.
+# m/s: slower is parked, within the accuracy of a radar or a positioning receiver.
 _PARKED_MPS = 0.5
-# Boxes of two cameras nearer to each other than so many deviations are of one object: both cameras would
-# have missed one of two.
+# Boxes of two cameras within this many deviations belong to one object: each of the cameras would otherwise
+# have missed one of two objects.
 _SAME_SIGMA = 3.0
-# All that tells two boxes apart: one that moves and one parked at the same place are two.
+# All properties that distinguish boxes: a moving and a parked one at the same place are two objects.
 BY_ALL = attrgetter("azimuth_rad", "label", "score", "std_rad", "width_rad", "moving")
 _BY_PLACE = attrgetter("position_m", "covariance", "velocity_mps", "existence_probability", "classes")
 _MEASURED = attrgetter("azimuth_rad", "std_rad", "width_rad", "moving")
@@ -31,18 +31,18 @@ _MEASURED = attrgetter("azimuth_rad", "std_rad", "width_rad", "moving")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """What is measured of objects at one instant, by one look or by several; shape (n,) each."""
+    """Measurements of objects at one instant, by one look or several; shape (n,) each."""
 
     azimuth_rad: FloatArray
     std_rad: FloatArray
-    width_rad: FloatArray  # NaN where it is not measured
-    moving: FloatArray  # 1 or 0, NaN where nothing tells
-    existence: FloatArray  # P(an object | it is of no known one)
-    log_new: FloatArray  # Density of new objects and clutter, nats: 1/rad of boxes, 1/m^2 of positions
-    found: FloatArray  # P(detected | in view), 0 of messages, which need no line of sight
+    width_rad: FloatArray  # NaN if not measured
+    moving: FloatArray  # 1 or 0, NaN if unknown
+    existence: FloatArray  # P(a real object | it is not a known one)
+    log_new: FloatArray  # Density of new objects and clutter, nats: 1/rad for boxes, 1/m^2 for positions
+    found: FloatArray  # P(detected | in view), 0 for messages, which need no line of sight
     classes: tuple[ClassShares, ...]
-    positions: tuple[Position, ...] = ()  # None of boxes
-    in_sight: bool = True  # Whether what is found must be in line of sight: not of messages
+    positions: tuple[Position, ...] = ()  # Empty for boxes
+    in_sight: bool = True  # Whether detection needs line of sight; false for messages
 
     @classmethod
     def of(
@@ -52,19 +52,19 @@ class Detections:
         positions: tuple[Position, ...] = (),
         in_sight: bool = True,
     ) -> "Detections":
-        """Return detections by their numbers, a row each, and what else is told of them."""
+        """Return detections from their rows of numbers, classes and positions."""
         columns = zip(_NUMBERS, np.array(rows, float).reshape(-1, len(_NUMBERS)).T, strict=True)
         return cls(**dict(columns), classes=classes, positions=positions, in_sight=in_sight)
 
     def line_of_sight(self, site: SiteGeometry) -> FloatArray:
-        """Return P(no occluder stands before what is detected there): a box is proof of it."""
+        """Return P(no occluder is in front) for every detection; it is 1 for boxes."""
         if not self.positions:
             return np.ones(len(self))
         range_m = np.array([math.hypot(*one.position_m) for one in self.positions])
         return site.line_of_sight(self.azimuth_rad, self.std_rad, range_m)
 
     def seen_through(self, site: SiteGeometry) -> "Detections":
-        """Return the detections if new objects are only found in line of sight."""
+        """Return the detections under the condition that new objects are detected in line of sight only."""
         in_sight = self.line_of_sight(site)
         total = 1.0 - self.existence * (1.0 - in_sight)
         existence, log_new = self.existence * in_sight / total, self.log_new + np.log(total)
@@ -76,19 +76,19 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One look of one sensor: where it has searched and how well, and all that it has found."""
+    """One look of one sensor: the searched sector, the miss rate and all detections."""
 
     source: str
-    detections: Detections  # Ordered by what they are: the sensor's order carries no meaning
-    sector: Sector | None  # None of messages, which search nothing
-    miss_rate: float | None  # None where it was not asked
-    weight: float  # Of a miss: looks that follow closely repeat each other's
+    detections: Detections  # Sorted by content: the sensor's order has no effect
+    sector: Sector | None  # None for messages, which search nothing
+    miss_rate: float | None  # None if the sensor was not queried
+    weight: float  # Weight of a miss: looks in quick succession repeat one another's misses
     range_m: float = math.inf
-    names_sector: bool = False  # Whether it is one of several cameras, each with a view of its own
+    names_sector: bool = False  # Whether the sensor is one of several cameras with separate views
 
 
 def miss_rates(scans: Sequence[Scan], azimuth_rad: FloatArray) -> FloatArray:
-    """Return P(all looks miss what is in view there), NaN where none has searched."""
+    """Return P(all looks miss an object in view there), NaN if no look has searched there."""
     rates = np.full(len(azimuth_rad), math.nan)
     for one in scans:
         if one.sector is not None and one.miss_rate is not None:
@@ -105,10 +105,10 @@ def birth(births: float, clutter_rate: float, score: float, size: float) -> tupl
               u = \frac{\lambda_b + \lambda_c / L}{A}, \qquad
               L = \frac{s}{1 - s}, \quad \lambda_c = -\log(1 - c)
 
-    with the new objects :math:`\lambda_b` and the false detections :math:`\lambda_c` that a look expects in
-    its view of size A, and the detector's score s as a likelihood ratio, of an object against clutter.
-    Source: D. Musicki, R. Evans, "Joint integrated probabilistic data association: JIPDA", IEEE Trans.
-    Aerosp. Electron. Syst. 40, 2004.
+    with the expected numbers of new objects :math:`\lambda_b` and false detections :math:`\lambda_c` per look
+    in a view of size A, and the detector's score s as a likelihood ratio of object to clutter. Source: D.
+    Musicki, R. Evans, "Joint integrated probabilistic data association: JIPDA", IEEE Trans. Aerosp. Electron.
+    Syst. 40, 2004.
 
     Examples
     --------
@@ -120,13 +120,13 @@ def birth(births: float, clutter_rate: float, score: float, size: float) -> tupl
 
 
 def camera_scan(seen: CameraLook, view: Sector, weight: float, street: StreetModel) -> Scan:
-    """Return the scan that a camera has made of a view."""
+    """Return the scan of a view by a camera."""
     answer, miss_rate, clutter_rate = seen.look.answer, None, street.clutter
     if not isinstance(answer, Unqueried):
-        # A look that misses everything would carry no information.
+        # A look that misses everything carries no information.
         miss_rate = min(answer.miss_rate, 1.0 - street.doubt)
         clutter_rate = min(answer.clutter_rate, 1.0 - street.doubt) or street.clutter
-    # Boxes that come without an answer were found without a stated miss rate.
+    # Boxes without an answer have no stated miss rate.
     found, width_rad = 1.0 - (miss_rate or 0.0), 2.0 * max(view.half_width_rad, LEAST_STD)
     boxes = sorted(seen.sightings, key=BY_ALL)
     rows = [
@@ -139,10 +139,10 @@ def camera_scan(seen: CameraLook, view: Sector, weight: float, street: StreetMod
 
 
 def position_scan(scan: PositionScan, weight: float, street: StreetModel) -> Scan:
-    """Return the scan of a radar or a lidar, or what messages tell."""
+    """Return the scan of a radar or a lidar, or of messages."""
     searched, places = scan.searched, tuple(sorted(scan.positions, key=_BY_PLACE))
     if searched is None:
-        # Messages report of half a disc.
+        # Messages cover half a disc.
         log_new = math.log(street.births / (0.5 * math.pi * FARTHEST_M**2))
         new = [(one.existence_probability, log_new) for one in places]
         return Scan(scan.source, _of_positions(places, new, None), None, None, weight)
@@ -168,9 +168,9 @@ def _of_positions(
 
 
 def fused(scans: Sequence[Scan]) -> tuple[Detections, FloatArray]:
-    r"""Return the detections of an instant, and 1 for the looks that each is by, shape (detections, looks).
+    r"""Return the detections of an instant, with 1 for each look that made one, shape (detections, looks).
 
-    Boxes of several cameras that are of one object are one detection, whatever the cameras are called:
+    Boxes of several cameras that belong to one object become one detection:
 
     .. math:: \sigma^{-2} = \sum_s \sigma_s^{-2}, \qquad z = \sigma^2 \sum_s \sigma_s^{-2} z_s
     """
@@ -191,7 +191,7 @@ def fused(scans: Sequence[Scan]) -> tuple[Detections, FloatArray]:
 
 
 def _in_order(every: Sequence[Detections]) -> tuple[Detections, list[int]]:
-    """Return all boxes of several looks in the order of what they are, and which look each is of."""
+    """Return all boxes of several looks, sorted by content, and the look of each box."""
     classes = [shares for one in every for shares in one.classes]
     looks = [number for number, one in enumerate(every) for _ in one.classes]
     rows = np.concatenate([_rows(one) for one in every])
@@ -205,12 +205,11 @@ _NUMBERS = [one.name for one in fields(Detections) if one.type is FloatArray]
 
 
 def _rows(boxes: Detections) -> FloatArray:
-    """Return the numbers of every box, shape (n, 7)."""
     return np.stack([getattr(boxes, name) for name in _NUMBERS], axis=1)
 
 
 def _near_pairs(boxes: Detections) -> list[tuple[int, int]]:
-    """Return the pairs that may be of one object, the nearest first."""
+    """Return the pairs of boxes that may belong to one object, the nearest first."""
     azimuth, variance, moving = boxes.azimuth_rad, np.square(boxes.std_rad), boxes.moving
     squares = wrap_angle(azimuth[:, None] - azimuth) ** 2 / (variance[:, None] + variance)
     near = np.triu((squares <= _SAME_SIGMA**2) & (moving[:, None] == moving), 1)
@@ -220,8 +219,7 @@ def _near_pairs(boxes: Detections) -> list[tuple[int, int]]:
 
 
 def _joined(boxes: Detections, groups: Sequence[list[int]]) -> Detections:
-    """Return one detection of every group of boxes."""
-    # Of two scores alike the label decides: the order of azimuths would turn with a mirrored world.
+    # Equal scores are ordered by label: an order of azimuths would change in a mirrored world.
     best = [max(group, key=lambda i: boxes.classes[i][0][::-1]) for group in groups]
     joined = Detections.of(_rows(boxes)[best], tuple(boxes.classes[i] for i in best))
     for at, group in enumerate(groups):

@@ -1,21 +1,22 @@
-r"""Where a hidden vehicle is, by the time that remains until it comes into view.
+r"""Azimuth of a hidden vehicle, from the time until it comes into view.
 
 It drives along the crossing street towards the edge of its occluder. With the street at distance d, the edge
-at azimuth a and speed v, it stands t seconds before line of sight at
+at azimuth a and speed v, its azimuth t seconds before line of sight is
 
 .. math:: \tan\theta(t) = \tan a + \frac{v}{d}\, t
 
-Metres are not in the sound, but the time to visible is: mean and variance are taken over its distribution.
+Sound contains no distance in metres, but it contains the time to visible. Mean and variance are taken over
+the distribution of this time.
 
-A hidden road user with a place p and a velocity w over ground comes into view when it passes the line from
+A hidden road user with position p and velocity w over ground comes into view when it passes the line from
 the ego vehicle, which drives along e(t), past the corner c of its occluder:
 
 .. math:: S_t = (c - e_t) \times (p + w t - e_t) \le 0
 
-Place and velocity are normal, and so is :math:`S_t` at each time. While the ego vehicle stands, it is the
+Position and velocity are normal, and so is :math:`S_t` at each time. For an ego vehicle at rest, it is the
 distance :math:`n \cdot (p + w t)` behind the line, times that of the corner, and the time to visible is the
-ratio :math:`T = -(n \cdot p) / (n \cdot w)`. The line past a corner at an unknown distance is assumed to keep
-its place on the ground.
+ratio :math:`T = -(n \cdot p) / (n \cdot w)`. If the distance of a corner is unknown, its line is assumed to
+keep its place on the ground.
 """
 
 import math
@@ -32,15 +33,15 @@ from .site_geometry import USUAL_EDGE_STD, SideGeometry, SiteGeometry
 from .track import Tracks
 
 _MIDDLE_S = 0.5 * (np.array(COMING_S) + np.array((0.0, *COMING_S[:-1])))
-# Beyond, the street ahead ends or bends.
+# Beyond this azimuth the street ahead ends or bends.
 _FARTHEST_RAD = math.radians(80.0)
-_STEPS = 51  # Of the times until which a line of sight is passed: between them it is interpolated
+_STEPS = 51  # Times at which the line of sight is evaluated; times between are interpolated
 
 
 def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float]:
-    """Return mean and deviation of the azimuth, radians, of a vehicle that comes with these probabilities.
+    """Return mean and deviation of the azimuth, radians, given the distribution of the time to visible.
 
-    Shapes: coming (9,), of the groups of `COMING_S`.
+    Shapes: coming (9,), for the groups of `COMING_S`.
 
     Examples
     --------
@@ -56,27 +57,27 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
     weight = (coming + TINY) / np.add.reduce(coming + TINY)
     mean = float(weight @ azimuth)
-    # The five degrees of the usual edge hold more than the edge, from which five junctions deviate by 2.6:
-    # errors of the time, which a known edge does not end. Half of their variance stays: likeliest on exam
-    # seed 1 with learned edges; without it squared errors are 1.42 of the variance.
+    # The usual 5 degrees of the edge also cover errors of the time: the edges of five junctions deviate by
+    # 2.6. A known edge does not remove errors of the time, so half of the usual variance stays, which is
+    # likeliest on exam seed 1 with learned edges. Without it squared errors are 1.42 of the variance.
     edge = 0.5 * (side.edge_std_rad**2 + max(side.edge_std_rad, USUAL_EDGE_STD) ** 2)
     variance = edge + side.street.extent_rad**2 + float(weight @ (azimuth - mean) ** 2)
     return wrap_angle(sign * mean - side.yaw_rad), math.sqrt(variance)
 
 
 def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: MotionBelief) -> MotionBelief:
-    r"""Return the motion of a vehicle that comes with these probabilities or, but for `share`, is in view.
+    r"""Return the motion of a vehicle that is hidden with probability `share`, and otherwise in view.
 
-    A vehicle past the edge goes on as it came,
+    A vehicle past the edge continues at the same speed,
 
     .. math:: \dot\theta = -\frac{v}{d} \cos^2\theta, \qquad \frac{\dot r}{r} = \dot\theta \tan\theta
 
-    and stands at the edge, give or take. Of a hidden one what was heard of its approach rate is kept.
+    and is near the edge. A hidden one keeps its measured approach rate.
     """
     hidden_rad, hidden_std = hidden_bearing(coming, side)
     in_view_rad = side.edge_azimuth_rad
     azimuth_rad = share * hidden_rad + (1.0 - share) * in_view_rad
-    # Mean and variance of the two together.
+    # Mean and variance of the mixture.
     apart = share * (1.0 - share) * (hidden_rad - in_view_rad) ** 2
     variance = share * hidden_std**2 + (1.0 - share) * side.street.past_std_rad**2 + apart
     along_rad = wrap_angle(side.edge_azimuth_rad + side.yaw_rad)
@@ -88,7 +89,7 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
     if not share:
         mean[RADIAL_RATE] = rate * math.tan(azimuth_rad + side.yaw_rad)
         spreads.append((RADIAL_RATE, rate_variance))
-    # They are read anew from the sequence, whatever else was believed of them.
+    # These components follow from the sequence alone and replace earlier beliefs about them.
     for axis, spread in spreads:
         covariance[axis], covariance[:, axis] = 0.0, 0.0
         covariance[axis, axis] = spread
@@ -98,10 +99,10 @@ def hidden_motion(coming: FloatArray, share: float, side: SideGeometry, before: 
 def motion_in_view(
     coming: FloatArray, shares: Sequence[float], site: SiteGeometry, before: MotionBelief
 ) -> MotionBelief:
-    """Return the motion of a vehicle that has come into view, from one of the sides with these shares.
+    """Return the motion of a vehicle that has come into view, given P(it came from a side) for each side.
 
-    Its mean is that of the likeliest side, its deviations hold the others: peaks move it there if it is not.
-    Shapes: coming (K, 9), shares (K,).
+    The mean is that of the likeliest side. The covariance includes the other sides, so that bearings can move
+    the mean there. Shapes: coming (K, 9), shares (K,).
     """
     pairs = zip(coming, site.sides, strict=True)
     every = MotionBelief.stacked([hidden_motion(one, 0.0, side, before) for one, side in pairs])
@@ -119,8 +120,8 @@ def time_to_visible(
 
     .. math:: P(T \le t \mid \text{hidden}) = P(S_t \le 0 \mid S_0 > 0)
 
-    The best time is that of the mean place and velocity; low and high hold nine of ten of those that come in
-    time. None are stated unless nine of ten come in time, nor of several places, which have a chance each.
+    The best time is that of the mean position and velocity; nine of ten entities that come in time do so
+    between low and high. The times are None if fewer than nine of ten come in time, or for several places.
 
     Examples
     --------
@@ -131,12 +132,12 @@ def time_to_visible(
     >>> round(float(chance), 3), [round(value, 1) for value in times_s]
     (1.0, [1.4, 1.7, 2.0])
     """
-    # Imported where it is needed: few streets have announced road users.
+    # Imported here: few streets have announced road users.
     from scipy.special import ndtr, ndtri
 
     along = np.array([math.cos(side.edge_azimuth_rad), math.sin(side.edge_azimuth_rad)])
     range_m, speed_mps = (side.corner_m, site.ego_speed_mps) if side.corner_m else (1.0, 0.0)
-    # Past its corner nothing is hidden by it.
+    # After the ego vehicle has passed a corner, the corner hides nothing.
     abeam_s = range_m * math.cos(side.edge_azimuth_rad) / (speed_mps or TINY)
     times_s = np.linspace(0.0, min(within_s, abeam_s) if abeam_s > 0.0 else within_s, _STEPS)
     ego, _ = arc(speed_mps, site.ego_yaw_rate_rad_s, times_s)
@@ -149,7 +150,7 @@ def time_to_visible(
     std = np.sqrt((spread * slope).sum(axis=-1) + edge**2)
     shared = (spread[..., 1:, :] * slope[:-1]).sum(axis=-1) + edge[..., 1:] * edge[..., :-1]
     past, correlation = -mean / std, shared / (std[..., 1:] * std[..., :-1])
-    # By steps: one that has passed the ego vehicle as well is behind its line again.
+    # Step by step: an entity that has also passed the ego vehicle is behind the line again.
     passes = _both_below(-past[..., :-1], past[..., 1:], -correlation).sum(axis=-1)
     chance = np.clip(passes / np.maximum(ndtr(-past[..., 0]), TINY), 0.0, 1.0)
     if chance.ndim or chance < 1.0 - 2.0 * TAIL:
@@ -161,7 +162,7 @@ def time_to_visible(
 
 
 def _both_below(h: FloatArray, k: FloatArray, correlation: FloatArray) -> FloatArray:
-    """Return P(both of two normal numbers of mean 0 and deviation 1 are below h and k), by Owen's T."""
+    """Return P(two correlated standard normal numbers are below h and k), by Owen's T."""
     from scipy.special import ndtr, owens_t
 
     h, k = (np.where(one, one, TINY) for one in (h, k))
@@ -171,7 +172,7 @@ def _both_below(h: FloatArray, k: FloatArray, correlation: FloatArray) -> FloatA
 
 
 def announced(tracks: Tracks, site: SiteGeometry) -> tuple[float, ...]:
-    """Return for each side the probability that a hidden entity with a place comes into view, shape (K,)."""
+    """Return P(a hidden entity with a position comes into view) for each side, shape (K,)."""
     hidden, chances = tracks.placed & ~tracks.seen & tracks.moving, [0.0] * len(site.sides)
     for k in set(tracks.side[hidden].tolist()):
         rows = (hidden & (tracks.side == k)).nonzero()[0]

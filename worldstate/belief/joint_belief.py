@@ -1,18 +1,18 @@
 r"""One distribution over the states of all approach sides together.
 
-The state of a side has two parts, and neither excludes the other: a hidden vehicle (none, a distant one, or
-one that comes into view within a bin of time), and a vehicle in view that came from there (no, yes). Beside
-all sides, a vehicle from elsewhere is in view or not. With A_k the chain of a side and A_e that of elsewhere,
+The state of a side has two parts that do not exclude each other: a hidden vehicle (none, a distant one, or
+one that comes into view within a time bin), and a vehicle in view that came from there (no, yes). Besides all
+sides, a vehicle from elsewhere is in view or not. With the chains A_k of the sides and A_e of elsewhere,
 
 .. math:: \bar p_t = p_{t-1}\, (A_1 \otimes \dots \otimes A_K \otimes A_e), \qquad
           p_t(s) \propto \bar p_t(s) \prod_j e_j(s)
 
-A reading q enters by what is new in it. It speaks of the hidden part of every side and of whether anything is
-in view; with r(s) these parts of a state, and n the belief that sound alone would have,
+Only the new part of a reading q enters. A reading covers the hidden part of every side and whether anything
+is in view. With these parts r(s) of a state, and the belief n from sound alone,
 
 .. math:: e(s) = \frac{q(r(s))}{\bar n(r(s))}, \qquad n_t(s) = \bar n_t(s)\, e(s)
 
-so that without other evidence p = n, whose parts are q, whatever the chain.
+so that without other evidence p = n, whose parts equal q, for any chain.
 """
 
 import math
@@ -35,9 +35,9 @@ BINS = len(COMING_S)
 # Hidden parts in the order of the axis: none, distant, and the bins of the time to visible.
 NONE, DISTANT, FIRST_BIN = 0, 1, 2
 PARTS = FIRST_BIN + BINS
-STATES = 2 * PARTS  # Of a side: hidden part, then whether one from there is in view
+STATES = 2 * PARTS  # Per side: hidden part, then whether a vehicle from there is in view
 COMES = np.arange(PARTS) >= FIRST_BIN
-_COMES_OF = {n: np.ix_(*[COMES.astype(int)] * n) for n in (1, 2)}  # Of so many sides that a reading is about
+_COMES_OF = {n: np.ix_(*[COMES.astype(int)] * n) for n in (1, 2)}  # Index by the number of sides in a reading
 _GROUP = {name: k for k, name in enumerate(GROUPS)}
 _SEEN, _OTHER = _GROUP["seen"], _GROUP["other"]
 _DISTANT = [_GROUP["rising"], _GROUP["falling"]]
@@ -46,18 +46,18 @@ _ABSENT = [_GROUP["none"], _GROUP["other"], _GROUP["past"], _SEEN]
 
 @dataclass(frozen=True, slots=True)
 class SidePrior:
-    """What is expected of a side without evidence: its hidden part, and whether one from there is in view."""
+    """Prior of one side: its hidden part, and P(a vehicle from there is in view)."""
 
     hidden: tuple[float, ...]  # shape (parts,)
     in_view: float
 
     @classmethod
     def of(cls, groups: FloatArray, in_view: float, street: StreetModel) -> "SidePrior":
-        """Return the prior that goes with a prior of the sequence's groups, shape (groups,).
+        """Return the prior of a side, given a prior of the sequence model's groups, shape (groups,).
 
-        As many leave the view as come into it, but at most so that all sides together have `in_view`.
+        P(in view) balances arrivals and departures, but is at most `in_view`.
         """
-        # Flows into a part of no probability have no proportion.
+        # A part with probability zero cannot be balanced.
         parts = np.maximum([groups[_ABSENT].sum(), groups[_DISTANT].sum(), *groups[:BINS]], TINY)
         total = math.fsum(parts)
         hidden = tuple(float(one) / total for one in parts)
@@ -72,7 +72,7 @@ class SidePrior:
 
 @lru_cache
 def _side_rates(prior: SidePrior, street: StreetModel) -> FloatArray:
-    """Return Q of a side, 1/s, which leaves its prior as it is; shape (states, states)."""
+    """Return the rates Q of one side, 1/s, which keep its prior stationary; shape (states, states)."""
     hop, share = np.eye(STATES), prior.states
     spans_s = np.diff((0.0, *COMING_S)).tolist()
     arrows = list[tuple[int, int, float]]()
@@ -90,17 +90,17 @@ def _side_rates(prior: SidePrior, street: StreetModel) -> FloatArray:
     return np.asarray((still - np.eye(STATES)) / HOP_S)
 
 
-# No slots: what follows from a prior is computed once.
+# No slots: derived values are computed once.
 @dataclass(frozen=True)
 class StreetPrior:
-    """What is expected of all sides and of elsewhere without evidence."""
+    """Prior of all sides and of elsewhere."""
 
     sides: tuple[SidePrior, ...]
     elsewhere: float  # P(a vehicle from elsewhere is in view)
 
     @classmethod
     def of(cls, groups: FloatArray, street: StreetModel) -> "StreetPrior":
-        """Return the prior that goes with priors of the sequence's groups, shape (sides, groups)."""
+        """Return the prior, given priors of the sequence model's groups, shape (sides, groups)."""
         return _street_prior(groups.tobytes(), street)
 
     @property
@@ -111,26 +111,27 @@ class StreetPrior:
 
     @cached_property
     def joint(self) -> "JointBelief":
-        """The belief that holds nothing else, whose marginals are computed once."""
+        """The belief without evidence; its marginals are computed once."""
         return JointBelief(self.weights)
 
     @property
     def by_part(self) -> FloatArray:
-        """The joint of the hidden parts and of whether anything is in view, shape (parts, ..., parts, 2)."""
+        """Joint of the hidden parts and of whether anything is in view, shape (parts, ..., parts, 2)."""
         return self.joint.by_part
 
     def carry(self, every: Sequence[FloatArray], street: StreetModel, step_ns: int) -> FloatArray:
-        """Return some distributions a step later, in their order."""
+        """Return some distributions one step later, in their order."""
         weights = np.array(every).transpose(*range(1, every[0].ndim + 1), 0)
         for chain in chains(self, street, step_ns):
-            # The axis in front goes to the end, so that at last the order is the same, but many in front.
+            # Each product shifts the front axis to the end; afterwards the axes are in order, with `every` in
+            # front.
             weights = weights.reshape(len(chain), -1).T @ chain
         return weights.reshape(-1, *every[0].shape)
 
 
 @lru_cache
 def chains(prior: StreetPrior, street: StreetModel, step_ns: int) -> list[FloatArray]:
-    """Return the chain of each side, and last that of a vehicle from elsewhere; rows sum to one."""
+    """Return the chain of each side, then that of vehicles from elsewhere; rows sum to one."""
     leaves = 1.0 / street.passage_s
     comes = leaves * prior.elsewhere / (1.0 - prior.elsewhere)
     elsewhere = np.array([[-comes, comes], [leaves, -leaves]])
@@ -142,20 +143,20 @@ def _street_prior(content: bytes, street: StreetModel) -> StreetPrior:
     groups = np.frombuffer(content).reshape(-1, len(GROUPS))
     seen = float((groups[:, _SEEN] / groups[:, BINS:].sum(axis=1)).mean())
     seen = min(max(seen, TINY), 1.0 - street.doubt)
-    # The rest of what is in view comes from elsewhere, however little that is.
+    # The other vehicles in view come from elsewhere, whose share is above zero.
     most = 1.0 - (1.0 - (1.0 - street.doubt) * seen) ** (1.0 / len(groups))
     sides = tuple(SidePrior.of(one, most, street) for one in groups)
     return StreetPrior(sides, 1.0 - (1.0 - seen) / math.prod(1.0 - one.in_view for one in sides))
 
 
 def _clear(sides: int) -> tuple[slice | int, ...]:
-    """Return where nothing is in view among states of shape (parts, 2, ..., parts, 2, 2)."""
+    """Return the index of the states with nothing in view, for shape (parts, 2, ..., parts, 2, 2)."""
     of_side: list[slice | int] = [slice(None), 0]
     return (*of_side * sides, 0)
 
 
 def _by_part(weights: FloatArray) -> FloatArray:
-    """Return the parts that a reading is about: (parts, ..., parts, 2), last whether anything is in view."""
+    """Return the joint of the hidden parts and of "anything is in view", shape (parts, ..., parts, 2)."""
     sides = weights.ndim - 1
     split = weights.reshape(*[PARTS, 2] * sides, 2)
     by_part = np.empty((*[PARTS] * sides, 2))
@@ -166,12 +167,12 @@ def _by_part(weights: FloatArray) -> FloatArray:
 
 
 def _spread(by_part: FloatArray) -> FloatArray:
-    """Return the value of every state from that of its parts: the inverse of the sums of `_by_part`.
+    """Return one value per state, given one value per combination of parts; the reverse of `_by_part`.
 
-    Along an axis of length one the value is the same for all parts.
+    Along an axis of length one all parts have the same value.
     """
     sides = by_part.ndim - 1
-    # In C order, as a checkpoint is read: sums over another order differ in their last bit.
+    # In C order, like an array from a checkpoint: sums in another order differ in the last bit.
     every = np.empty((*[PARTS, 2] * sides, 2))
     every[:] = by_part[..., 1].reshape(*[one for n in by_part.shape[:-1] for one in (n, 1)], 1)
     every[_clear(sides)] = by_part[..., 0]
@@ -179,9 +180,9 @@ def _spread(by_part: FloatArray) -> FloatArray:
 
 
 def usual_groups(hidden: Sequence[float], in_view: float) -> FloatArray:
-    """Return the groups of a street of which only chances are known, shape (sides, groups).
+    """Return the groups of a street, given only P(hidden) by side and P(in view), shape (sides, groups).
 
-    Vehicles that come are as likely at any time within eight seconds.
+    A vehicle that comes is equally likely at any time within eight seconds.
     """
     groups = np.zeros((len(hidden), len(GROUPS)))
     for row, chance in zip(groups, hidden, strict=True):
@@ -191,16 +192,16 @@ def usual_groups(hidden: Sequence[float], in_view: float) -> FloatArray:
 
 
 def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> FloatArray:
-    r"""Return the joint of the parts of one or two sides from the reading of each: (parts, .., parts, 2).
+    r"""Return the joint of the parts from the readings of one or two sides, shape (parts, .., parts, 2).
 
     .. math:: P(\bar C_k, \bar C_j) = \tfrac{1}{2} \sum_k \big(1 - P(C_k) - q_k(other)\big)
 
-    within what the two chances allow. Given on which sides vehicles come, the bins of the sides are
-    independent, and each side has its own marginal. If none comes, what is far off is one vehicle on
-    whichever sides it sounds, and what is in view is all that sounds. P(another one is in view ahead of one
-    that comes) is the mean of that by sound, of the street without it (share `by_sound`), and of the usual
-    one (the rest), but at most the first: a camera that finds what the sound denies is no evidence for a
-    hidden vehicle. Of one side "other" is a street without it.
+    within the limits of the two chances. Given the sides from which vehicles come, the bins of the sides are
+    independent, and each side keeps its marginal. If no vehicle comes, distant sound on several sides is one
+    vehicle, and a vehicle in view accounts for all sound. If one comes, P(another one is in view) is a
+    weighted mean: P(in view) by sound has the weight `by_sound`, the usual P(in view) the rest. It is at most
+    the former, because a camera detection that contradicts the sound is no evidence for a hidden vehicle.
+    With one side, "other" means a street without a vehicle.
 
     Shapes: groups (sides, groups).
     """
@@ -210,7 +211,7 @@ def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> 
     distant = np.minimum(np.add.reduce(groups[:, _DISTANT], 1) / rest, 1.0)
     seen = min(float(mean(groups[:, _SEEN] / rest)), 1.0)
     behind = min((1.0 - by_sound) * usual_in_view + by_sound * seen, seen)
-    # Of every side the hidden parts, given whether a vehicle comes there.
+    # The hidden parts of every side, given whether a vehicle comes there.
     far_or_not = np.array([1.0 - distant, distant]).T
     parts = np.concatenate([far_or_not, coming / np.maximum(every, TINY)[:, None]], axis=1)
     comes = every.tolist()
@@ -224,7 +225,7 @@ def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> 
         chances = np.array([[0.0, comes[1] - both], [comes[0] - both, both]])
     beside = chances[_COMES_OF[len(groups)]] * reduce(np.multiply.outer, parts)
     joint = np.multiply.outer(beside, (1.0 - behind, behind))
-    # If none comes: what is in view is all that is heard, and what is far off is as few as explain it.
+    # If none comes, a vehicle in view accounts for all sound, with as few distant vehicles as possible.
     far = np.minimum(distant / max(1.0 - seen, TINY), 1.0).tolist()
     for heard in product((0, 1), repeat=len(groups)):
         on, off = [[one for one, is_far in zip(far, heard, strict=True) if is_far == k] for k in (1, 0)]
@@ -237,14 +238,14 @@ def joint_reading(groups: FloatArray, usual_in_view: float, by_sound: float) -> 
 def window_likelihoods(
     hidden: Sequence[float | None], visible: float, none: float, in_view: float
 ) -> FloatArray:
-    r"""Return the likelihoods of a window of the parts, shape (parts, ..., parts, 2), the largest one.
+    r"""Return the likelihoods of a window for the parts, shape (parts, ..., parts, 2), up to a factor.
 
     .. math:: \ell(s) = \frac{1}{|C|} \sum_{k \in C} \ell_{hid,k}
 
-    of the sides C from which a vehicle comes, or that of one in view, or of none, if there is no such side:
-    eq. (6), for explanations that do not exclude one another. A window that denies one in view denies it
-    beside a hidden one as well; the mean over the usual chance `in_view` stays. Of a side without a number
-    (None) the window leaves open what comes.
+    for the sides C from which a vehicle comes. Without such a side it is the likelihood of a vehicle in view,
+    or of none: eq. (6) for explanations that do not exclude one another. Evidence against a vehicle in view
+    also holds beside a hidden one, with an unchanged mean over the usual chance `in_view`. A side without a
+    value (None) gets no evidence from the window.
     """
     known = [one is not None for one in hidden]
     nats = np.array([-math.inf if one is None else one for one in hidden])
@@ -260,20 +261,22 @@ def window_likelihoods(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorTrust:
-    """Whether a sensor works, jointly with the state of the street, and its last look."""
+    """Joint distribution of the street and "the sensor works", with the sensor's last look."""
 
-    works: FloatArray  # The joint with "it works", of the shape of the belief
+    works: FloatArray  # P(state, it works), in the shape of the belief
     stamp_ns: int
     miss_rate: float
-    # A look that begins a run weighs as one, and pays ahead for the next ones, which repeat its misses.
+    # The first look of a run has full weight. The next looks repeat its misses and have less weight until
+    # this is balanced.
     prepaid: float = 1.0
     begins: bool = True
 
     def next_weight(self, stamp_ns: int, street: StreetModel) -> tuple[float, float, bool]:
-        """Return the weight of the sensor's next look, what is prepaid after it, and whether it begins a run.
+        """Return the weight of the sensor's next look, the rest that is prepaid, and whether a run begins.
 
-        Looks a correlation time apart weigh as one each, any number within one as one together, and looks at
-        a steady rate as their time over it, in which the first one stands for an interval as well.
+        Looks one correlation time apart have weight one each; any number within one correlation time has
+        weight one together. At a steady rate the weight is the interval over the correlation time, and the
+        first look also represents an interval.
         """
         credit = seconds(stamp_ns - self.stamp_ns) / street.look_s
         if credit >= 1.0:
@@ -282,17 +285,17 @@ class SensorTrust:
         return max(credit - self.prepaid, 0.0), max(self.prepaid - credit, 0.0), False
 
 
-# No slots: marginals are computed once, and read by every entity and cue.
+# No slots: marginals are computed once and used by every entity and cue.
 @dataclass(frozen=True, eq=False)
 class JointBelief:
-    """The belief of all sides, what each source alone would make of it, and how far sensors are trusted."""
+    """Belief over all sides, the belief from each source alone, and the trust in each sensor."""
 
     weights: FloatArray  # shape (states, ..., states, 2)
-    alone: dict[str, FloatArray] = field(default_factory=dict)  # The same shape, by the source
-    trust: dict[str, SensorTrust] = field(default_factory=dict)  # By the sensor
+    alone: dict[str, FloatArray] = field(default_factory=dict)  # The same shape, by source
+    trust: dict[str, SensorTrust] = field(default_factory=dict)  # Trust by sensor
 
     def carried(self, prior: StreetPrior, street: StreetModel, step_ns: int) -> "JointBelief":
-        """Return the belief a time step later, in which sensors fail and recover."""
+        """Return the belief one time step later; sensors may fail or recover."""
         every = [self.weights, *self.alone.values(), *(one.works for one in self.trust.values())]
         weights, *rest = prior.carry(every, street, step_ns)
         alone, works = dict(zip(self.alone, rest, strict=False)), rest[len(self.alone) :]
@@ -304,7 +307,7 @@ class JointBelief:
         return JointBelief(weights, alone, trust)
 
     def times(self, evidence: FloatArray) -> "JointBelief":
-        """Return the belief after evidence, a likelihood of every state."""
+        """Return the belief after evidence, given one likelihood per state."""
         weights = self.weights * evidence
         total = np.add.reduce(weights, None)
         trust = {name: replaced(one, works=one.works * evidence / total) for name, one in self.trust.items()}
@@ -325,10 +328,9 @@ class JointBelief:
                   \frac{q'(r)}{\bar n(r)} \propto
                   s\, \frac{q(r)}{\bar n(r)} + (1 - s)\, \frac{q(0)}{\bar n(0)}
 
-        with the share a of what is new in a reading that is believed at once, and the chance s that the
-        source would have heard a vehicle that comes (`heard`): a masked one sounds as if it were not there.
-        Parts in which none comes, 0, count together and stay. The first reading of a source is new as a
-        whole.
+        with the new share a of a reading, and the chance s that the source detects a vehicle that comes
+        (`heard`): a masked vehicle sounds as if it were absent. The parts in which none comes, 0, are added
+        up and keep their ratio. The first reading of a source is entirely new.
         """
         before = self.alone.get(source)
         if before is None:
@@ -351,7 +353,7 @@ class JointBelief:
         return self.times(_spread(by_part))
 
     def at_prior(self, before: FloatArray, after: FloatArray) -> "JointBelief":
-        """Return the belief at another prior than it was held at, each of the shape of the belief."""
+        """Return the belief with another prior; both priors have the shape of the belief."""
         factor = after / before
         alone = {name: _normed(one * factor) for name, one in self.alone.items()}
         return replaced(self.times(factor), alone=alone)
@@ -359,18 +361,18 @@ class JointBelief:
     def looked(
         self, sensor: str, answer: Absent | Present, stamp_ns: int, street: StreetModel
     ) -> "JointBelief":
-        r"""Return the belief after a look of a sensor at all that is in line of sight.
+        r"""Return the belief after a look of a sensor at everything in line of sight.
 
         .. math:: e(s) = w_v\, \ell_v^\kappa + (1 - w_v)\, \ell_0^\kappa
 
-        with the probability w that the sensor works, the likelihoods of a sensor that works and of one that
-        does not, and the weight :math:`\kappa` of a look that repeats the misses of those before.
+        with the probability w that the sensor works, the likelihoods for a working and a failed sensor, and
+        the weight :math:`\kappa` of a look that repeats the misses of earlier ones.
         """
         miss, clutter = answer.miss_rate, answer.clutter_rate
         works, run = street.works * self.weights, (1.0, 1.0, True)
         if (last := self.trust.get(sensor)) is not None:
             works, run = last.works, last.next_weight(stamp_ns, street)
-        # Of a look with something in view, with nothing in view, and of a sensor that has failed.
+        # Likelihoods with something in view, with nothing in view, and for a failed sensor.
         told = np.array([miss * (1.0 - clutter), 1.0 - clutter, 1.0])
         if isinstance(answer, Present):
             told = np.array([1.0 - told[0], clutter, clutter])
@@ -387,10 +389,10 @@ class JointBelief:
 
         .. math:: p' = (1 - r)\, E[p\, e] + r\, p, \qquad e(b) = 1 \text{ if one comes, else } p_u
 
-        with the chance r that it was another vehicle than the one believed there, and E, which puts it in
-        view and another one behind it as often as vehicles follow. It may have been believed on another side,
-        which the sound has confused with this one. If one was believed `apart` on another side, its
-        marginal stays: two vehicles are not one of unknown side.
+        with the chance r that it was another vehicle than the one believed there. E puts the believed vehicle
+        in view, and another one behind it as often as vehicles follow. It may have been believed on another
+        side if the sound confused the two. If a vehicle was believed `apart` on another side, the marginal of
+        that side stays: two vehicles are not one of unknown side.
         """
         likelihood = np.where(COMES, 1.0, street.unheard)
         gaps = np.diff(np.minimum((0.0, *COMING_S), street.follows_s)) / street.follows_s
@@ -415,7 +417,7 @@ class JointBelief:
 
         weights = after(self.weights)
         trust = {name: replaced(one, works=after(one.works)) for name, one in self.trust.items()}
-        # What was heard until now was the vehicle that is in view.
+        # The earlier sound came from the vehicle that is in view now.
         return JointBelief(weights, dict.fromkeys(self.alone, weights), trust)
 
     @property
@@ -436,7 +438,7 @@ class JointBelief:
 
     @cached_property
     def emerged_from(self) -> FloatArray:
-        """P(one from a side is in view, and none comes there), shape (sides,)."""
+        """P(a vehicle from a side is in view, and none comes there), shape (sides,)."""
         axes = [tuple([j for j in range(self.sides + 1) if j != k]) for k in range(self.sides)]
         marginals = [np.add.reduce(self.weights, one) for one in axes]
         return np.array([np.add.reduce(one[1 : 2 * FIRST_BIN : 2]) for one in marginals])
@@ -448,7 +450,7 @@ class JointBelief:
 
     @cached_property
     def explanations(self) -> tuple[float, float, float]:
-        """P(hidden), P(visible), P(none) of eq. (6): one is hidden anywhere, else one in view, else none."""
+        """P(hidden), P(visible), P(none) of eq. (6): one hidden on any side, else one in view, else none."""
         visible = float(self.by_part[(*[NONE] * self.sides, 1)])
         none = float(self.by_part[(*[NONE] * self.sides, 0)])
         return max(1.0 - visible - none, 0.0), visible, none

@@ -10,26 +10,26 @@ from worldstate.ground.values import replaced
 
 from .street_model import StoredStreet, StreetModel
 
-# Names in the street model, in the order of the arguments of 0.3; one number ends what is seen and heard.
+# Fields of the street model, in the order of the arguments of 0.3; one value ends seen and heard entities.
 _FORMER = ("look_s", "birth", "death", "death")
 
 
 @dataclass(frozen=True, slots=True)
 class FilterSettings:
-    """What a filter is given beside its context and its policy.
+    """Settings of a filter, apart from its context and its policy.
 
     Parameters
     ----------
     window_s : float
-        Length of the window that a signature is computed on. Windows that overlap repeat most of their
-        samples: a bearing or approach rate weighs kappa = (time since the last one) / window, at most 1.
+        Length of the window of a signature, s. Overlapping windows share most of their samples: a bearing
+        or approach rate has the weight kappa = (time since the last one) / window, at most 1.
     street : StreetModel
-        Numbers of the belief.
+        Parameters of the belief.
     windows : {"posterior", "likelihood"}
-        How windows enter that no sequence model reads: by what is new in their posterior, or multiplied as
-        likelihoods, each by its share of a window that is new.
+        How a window enters if no sequence model interprets it: by the new part of its posterior, or by
+        its likelihoods, weighted with the new share of the window.
     stream : str
-        Name that entity ids are derived from: the same stream gives the same ids.
+        Name from which entity ids are derived; the same stream gives the same ids.
 
     Raises
     ------
@@ -42,8 +42,8 @@ class FilterSettings:
     1.0
     """
 
-    window_s: float = 1.0  # Of the published feature
-    # Of 0.3, in its order; for one minor version they are taken for the street model's numbers.
+    window_s: float = 1.0  # Length for the published feature
+    # Arguments of 0.3, in its order; for one minor version they set numbers of the street model.
     look_interval_s: InitVar[float | None] = None
     birth_probability: InitVar[float | None] = None
     death_probability: InitVar[float | None] = None
@@ -55,7 +55,7 @@ class FilterSettings:
     def __post_init__(self, *former: float | None) -> None:
         given = [one for one in zip(_FORMER, former, strict=True) if one[1] is not None]
         if given:
-            changed: dict[str, Any] = dict(reversed(given))  # Of both `death_probability` counts
+            changed: dict[str, Any] = dict(reversed(given))  # `death_probability` has precedence
             names = ", ".join(sorted(changed))
             warnings.warn(f"give {names} to StreetModel, as FilterSettings.street", DeprecationWarning, 3)
             object.__setattr__(self, "street", replaced(self.street, **changed))

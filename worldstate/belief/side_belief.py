@@ -1,4 +1,4 @@
-"""The belief of all approach sides at one time: everything that a snapshot says of them is read from here."""
+"""Belief over all approach sides at one time; all values per side of a snapshot come from here."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from worldstate.ground.values import replaced
 
 @dataclass(frozen=True, slots=True)
 class SideBelief:
-    """Marginals of what is on the approach sides; sides do not exclude each other.
+    """Marginals over the approach sides; sides do not exclude each other.
 
     Examples
     --------
@@ -19,20 +19,20 @@ class SideBelief:
     """
 
     hidden: tuple[float, ...]  # shape (K,): P(a vehicle is hidden on a side)
-    emerged: tuple[float, ...]  # shape (K,): P(in view, come from there)
-    risks: tuple[float, ...]  # shape (K,): P(one comes into view there within eight seconds)
-    risk: float  # P(one comes into view anywhere)
+    emerged: tuple[float, ...]  # shape (K,): P(a vehicle from there is in view)
+    risks: tuple[float, ...]  # shape (K,): P(a vehicle comes into view there within eight seconds)
+    risk: float  # P(a vehicle comes into view on any side)
     hypotheses: tuple[float, float, float]  # P(hidden), P(visible), P(none) of eq. (6)
     both: float = 0.0  # P(vehicles are hidden on two sides)
 
     def hidden_on(self, side: int | None) -> float:
-        """Return P(a vehicle is hidden on a side), on any where None."""
+        """Return P(a vehicle is hidden on a side); None means any side."""
         return sum(self.hidden) - self.both if side is None else self.hidden[side]
 
     def existence(self, side: int | None) -> float:
-        """Return the probability that there is a vehicle of a side, of any where None."""
+        """Return P(there is a vehicle of a side); None means any side."""
         emerged = sum(self.emerged) if side is None else self.emerged[side]
-        # The sum of two exponentials exceeds one by rounding where nothing else is possible.
+        # The sum of two exponentials can exceed one by rounding if nothing else is possible.
         return min(self.hidden_on(side) + emerged, 1.0)
 
     def hidden_share(self, side: int | None) -> float:
@@ -49,9 +49,9 @@ class SideBelief:
         return tuple([share / total for share in shares])
 
     def beside(self, nothing: float) -> "SideBelief":
-        r"""Return the belief if no vehicle is in view with a probability e.
+        r"""Return the belief if P(no vehicle is in view) is e.
 
-        .. math:: P(none) \leftarrow \min(P(none), e), \qquad P(vis) \text{ takes what that loses}
+        .. math:: P(none) \leftarrow \min(P(none), e), \qquad P(vis) \text{ gains the difference}
 
         Examples
         --------
@@ -68,8 +68,8 @@ class SideBelief:
         .. math:: r_k \leftarrow \max(r_k, a_k), \qquad
                   P(hid) \leftarrow \max\Big(P(hid),\ 1 - \prod_k (1 - a_k)\Big)
 
-        What is heard on a side may be the announced vehicle, while those of two sides are two. The other
-        explanations shrink alike.
+        Sound on a side may come from the announced vehicle; vehicles announced on two sides are two. The
+        other explanations shrink in proportion.
 
         Examples
         --------

@@ -1,4 +1,4 @@
-"""Geometry of the site: where hidden vehicles are, where they come into view, and what the camera sees."""
+"""Geometry of the site: azimuths of hidden vehicles, edges of occluders, and the camera's view."""
 
 import math
 from dataclasses import dataclass, field
@@ -17,17 +17,17 @@ from .street_model import StreetModel
 
 
 def in_view(street: StreetModel) -> MotionBelief:
-    """Return the prior of a vehicle in view, of which only the azimuth is measured."""
+    """Return the prior motion of visible vehicles; only their azimuth is measured."""
     spread = (1.0, 1.0, 0.5, street.range_spread)
     return MotionBelief.around((0.0, 0.0, 0.0, math.log(street.range_m)), spread)
 
 
 IN_VIEW = in_view(StreetModel())
-# A vehicle in a crossing street stands ahead, not abeam: at the default corner, up to 92 degrees.
+# A vehicle in a crossing street is ahead, not abeam: at the default corner, up to 92 degrees.
 _WIDEST_RAD = math.radians(60.0)
 
 
-USUAL_EDGE_STD = math.radians(5.0)  # Of the corner of a usual junction
+USUAL_EDGE_STD = math.radians(5.0)  # Deviation of the corner of a usual junction
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,41 +42,41 @@ class SideGeometry:
 
     label: str  # Direction label of the signature model
     edge_azimuth_rad: float  # Edge of the occluder
-    azimuth_rad: float  # Where vehicles are while it hides them
+    azimuth_rad: float  # Expected azimuth of a hidden vehicle
     std_rad: float
     edge_std_rad: float = USUAL_EDGE_STD
-    pace_hz: float = 0.5  # Speed over the distance of the crossing lane
+    pace_hz: float = 0.5  # Speed divided by the distance of the crossing lane
     hides: bool = True
-    yaw_rad: float = 0.0  # Of the ego in the map, where the edge is known there
-    corner_m: float | None = None  # Distance of the corner; None if it is not known
-    certainty: float = 1.0  # P(the occluder stands there)
-    wall_m: float = 0.0  # How far beside the ego its wall runs: what is nearer stands in front; 0 if unknown
+    yaw_rad: float = 0.0  # Yaw of the ego vehicle in the map, if the edge is known there
+    corner_m: float | None = None  # Distance of the corner; None if unknown
+    certainty: float = 1.0  # P(the occluder is there)
+    wall_m: float = 0.0  # Lateral distance of its wall; nearer objects are in front of it; 0 if unknown
     street: StreetModel = field(default_factory=StreetModel)
 
     @property
     def outwards(self) -> float:
-        """The way from the edge to what it hides: 1 to the left, -1 to the right."""
+        """Direction from the edge to the hidden area: 1 to the left, -1 to the right."""
         return math.copysign(1.0, wrap_angle(self.azimuth_rad - self.edge_azimuth_rad))
 
     @property
     def bias_std_rad(self) -> float:
-        """Error of the azimuth of hidden sound that averaging does not remove: half of where vehicles are."""
+        """Azimuth error of hidden sound that averaging does not remove: half the spread of vehicles."""
         return 0.5 * self.std_rad
 
     def distance_rad(self, azimuth_rad: NumbersT, width_rad: NumbersT | float = 0.0) -> NumbersT:
-        """Return the angle, >= 0, between the occluder's edge and the end of a box that leads past it."""
+        """Return the angle, >= 0, between the occluder's edge and the leading end of a box."""
         return abs(wrap_angle(azimuth_rad - 0.5 * self.outwards * width_rad - self.edge_azimuth_rad))
 
     def prior(self) -> MotionBelief:
         """Return the prior motion of a vehicle hidden here."""
         street = self.street
         mean = self.azimuth_rad, 0.0, -street.closing_hz, math.log(street.range_m)
-        # Give or take as much again.
+        # The deviation is as large as the mean.
         spread = self.std_rad, street.closing_hz, street.closing_hz, street.range_spread
         return MotionBelief.around(mean, spread)
 
 
-# No slots: what follows from the sides is computed once, and read in every step.
+# No slots: derived values are computed once and used in every step.
 @dataclass(frozen=True)
 class SiteGeometry:
     """All sides, the field of view and the settings, constant from step to step."""
@@ -84,12 +84,12 @@ class SiteGeometry:
     sides: tuple[SideGeometry, ...]  # Approach sides, in the order of the signature's directions
     view_half_angle_rad: float  # Half the field of view of the co-evidence channel, centred on the x axis
     settings: FilterSettings  # Windows, births and deaths
-    ego_speed_mps: float = 0.0  # Along the x axis
+    ego_speed_mps: float = 0.0  # Speed along the x axis
     ego_yaw_rate_rad_s: float = 0.0
 
     @cached_property
     def street(self) -> StreetModel:
-        """The numbers of the belief."""
+        """The parameters of the belief."""
         return self.settings.street
 
     def nearest_side(self, azimuth_rad: float) -> int:
@@ -97,14 +97,14 @@ class SiteGeometry:
         return min(range(len(self.sides)), key=lambda k: self.sides[k].distance_rad(azimuth_rad))
 
     def hiding_side(self, position_m: tuple[float, float]) -> int | None:
-        """Return the side whose occluder hides what stands at a place, if one does."""
+        """Return the side whose occluder hides a position, or None."""
         x, y = position_m
         (chances,) = self.behind(np.array([math.atan2(y, x)]), LEAST_STD, np.array([math.hypot(x, y)]))
         side = int(chances.argmax())
         return side if chances[side] >= 0.5 else None
 
     def behind(self, azimuth_rad: FloatArray, std_rad: FloatArray | float, range_m: FloatArray) -> FloatArray:
-        """Return the chances that what stands at some places is behind the occluders, shape (n, K)."""
+        """Return P(an object is behind an occluder) for some positions and all occluders, shape (n, K)."""
         edge_rad, _, outwards = self._edges[..., 0]
         yaw_rad, wall_m = np.array([(one.yaw_rad, one.wall_m) for one in self.sides]).T
         beside_m = range_m[:, None] * np.abs(np.sin(azimuth_rad[:, None] + yaw_rad))
@@ -119,7 +119,7 @@ class SiteGeometry:
 
     @cached_property
     def _sight(self) -> Sector:
-        """What all occluders leave free, by their own sides: those of the x axis turn with the ego."""
+        """The sector that no occluder covers, by their own directions, since the x axis turns."""
         ways = (-1.0, 1.0)
         return Sector.in_sight(
             *([k.edge_azimuth_rad for k in self.sides if k.outwards == way] for way in ways)
@@ -127,13 +127,13 @@ class SiteGeometry:
 
     @cached_property
     def expected(self) -> MotionBelief:
-        """What is expected of vehicles that are hidden on each side, and last of those in view."""
+        """Priors of the vehicles hidden on each side, and last of those in view."""
         return MotionBelief.stacked([*(side.prior() for side in self.sides), in_view(self.street)])
 
     def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
-        """Return the chances that azimuths lie past the edges on their way, shape (n, K).
+        """Return P(an azimuth is past the edge) for azimuths that move a way, shape (n, K).
 
-        The way is 1 to the left, -1 to the right, 0 of none.
+        The way is 1 to the left, -1 to the right, 0 without a direction.
         """
         edge_rad, edge_std, outwards = self._edges
         past = way * wrap_angle(azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)
@@ -141,44 +141,44 @@ class SiteGeometry:
         return normal_shares(np.where((way * outwards > 0.0) & hides, past, -np.inf).T)
 
     def line_of_sight(self, azimuth_rad: FloatArray, std_rad: FloatArray, range_m: FloatArray) -> FloatArray:
-        """Return P(no occluder stands before what is at some places)."""
+        """Return P(no occluder is in front) for some positions."""
         hidden = self.behind(azimuth_rad, np.hypot(std_rad[:, None], self._edges[1].T), range_m)
         return np.asarray(1.0 - np.maximum.reduce(hidden * [one.certainty for one in self.sides], 1))
 
     def view(self, look: Look) -> Sector:
-        """Return where a look has searched."""
+        """Return the sector that a look has searched."""
         told = look.sector_rad
         return Sector(0.0, self.view_half_angle_rad) if told is None else Sector.between(*told)
 
     def in_sight(self, seen: CameraLook) -> Look:
-        r"""Return a look as one at all that is in line of sight: of where it did not search, it missed all.
+        r"""Return a look as a look at the whole line of sight; outside its sector it missed everything.
 
         .. math:: \beta \leftarrow s\, \beta + (1 - s)
 
-        with the share s of the line of sight that it searched. One that names no sector has searched it all.
+        with the searched share s of the line of sight. A look without a sector has searched all of it.
         """
         look, answer = seen.look, seen.look.answer
         if look.sector_rad is None or isinstance(answer, Unqueried):
             return look
         sight = self._sight
         both = sight.overlap(self.view(look))
-        # Rounding may take the overlap above the whole.
+        # Rounding can make the overlap larger than the whole.
         share = 0.0 if both is None else min(both.half_width_rad / sight.half_width_rad, 1.0)
         found = any(one.moving and sight.touches(one.azimuth_rad, one.width_rad) for one in seen.sightings)
         miss = share * answer.miss_rate + (1.0 - share)
         if not found:
             return replaced(look, answer=Absent(miss, answer.clutter_rate))
-        # With a clutter rate of zero a box would rule out everything else.
+        # With a clutter rate of zero, a box would exclude everything else.
         return replaced(look, answer=Present(miss, answer.clutter_rate or self.street.clutter))
 
 
 def normal_shares(deviations: FloatArray) -> FloatArray:
-    """Return the shares of a normal distribution below so many deviations."""
-    # Of a few numbers each: importing scipy.special takes a tenth of a second of every start.
+    """Return the shares of a normal distribution below the given deviations."""
+    # The arrays are small, and importing scipy.special adds 0.1 s to every start.
     shares = [normal_share(one) for one in deviations.ravel().tolist()]
     return np.array(shares, float).reshape(deviations.shape)
 
 
 def normal_share(deviations: float) -> float:
-    """Return the share of a normal distribution below so many deviations."""
+    """Return the share of a normal distribution below the given deviations."""
     return 0.5 * math.erfc(-deviations / math.sqrt(2.0))

@@ -1,13 +1,13 @@
-r"""Tracks of sound: where something sounds, by bearings alone, as of an array without a model.
+r"""Tracks of sound from bearings alone, for an array without a model.
 
-Existence e and azimuth of a track are those of the integrated probabilistic data association filter. A
-bearing z counts for the track i that it is likeliest of, if it is likelier than any direction; else a track
+Existence e and azimuth of a track follow the integrated probabilistic data association filter. A bearing z
+belongs to its likeliest track i if it is likelier there than in a random direction; otherwise a new track
 begins:
 
 .. math:: \frac{e}{1 - e} \leftarrow \frac{e}{1 - e} \big(1 - p + 2\pi\, p\, N(z; \theta_i, P_i + R)\big)^w,
 
-with the chance p that a source which sounds is the loudest one, and the share w of its sound that is new.
-For the others N is 0. In silence a track fades.
+with the chance p that an active source is the loudest one, and the new share w of its sound. For other tracks
+N is 0. In silence a track fades.
 
 References
 ----------
@@ -27,12 +27,12 @@ from .kinematics.motion import AZIMUTH, MotionBelief, log_azimuth_likelihood, pr
 from .street_model import StreetModel
 
 MOST_SOUNDS = 8
-# Of one talker in a room, 0.79 to 1.0 of the usable bearings lie within 15 degrees of it, of each of two 0.23
-# to 0.56 (five microphones on a ring of 4.5 cm, six simulated rooms of 0.25 to 0.6 s).
+# One talker in a room: 79 to 100 % of the usable bearings are within 15 degrees of the talker; two talkers:
+# 23 to 56 % for each (five microphones on a ring of 4.5 cm, six simulated rooms of 0.25 to 0.6 s).
 _LOUDEST = 0.5
-# Sound that a bearing is read from; those that overlap say the same thing again.
+# Duration of the sound behind a bearing; overlapping bearings repeat one another.
 _BEARING_S = 0.2
-# Of a track with one bearing; and the largest, beyond which a track would outlive its sound for long.
+# Existence after one bearing, and its limit; without a limit a track would outlive its sound for long.
 _FIRST, _MOST = 0.2, 0.99
 # A car that passes 5 m away at 10 m/s turns by up to 2 rad/s.
 _RATE_STD_RAD_S, _NEAR_M = 1.0, 5.0
@@ -40,7 +40,7 @@ _RATE_STD_RAD_S, _NEAR_M = 1.0, 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundTrack:
-    """Something that one source hears: its azimuth, whether it is there, and since when."""
+    """A source of sound as one array receives it: azimuth, existence and times."""
 
     source: str
     motion: MotionBelief
@@ -50,7 +50,7 @@ class SoundTrack:
 
 
 def faded(tracks: Iterable[SoundTrack], step_s: float, street: StreetModel) -> tuple[SoundTrack, ...]:
-    """Return tracks at a later time, with nothing heard."""
+    """Return tracks at a later time without a bearing."""
     kept = math.exp(-step_s / street.unseen_s)
     return tuple(
         replace(one, existence=kept * one.existence, motion=predict(one.motion, step_s, street.acceleration))
@@ -62,11 +62,11 @@ def faded(tracks: Iterable[SoundTrack], step_s: float, street: StreetModel) -> t
 def followed(
     tracks: Sequence[SoundTrack], measurement: Measurement, new_s: float, street: StreetModel
 ) -> tuple[SoundTrack, ...]:
-    """Return tracks after the bearing of a measurement, of whose sound so much is new."""
+    """Return tracks after the bearing of a measurement with `new_s` seconds of new sound."""
     bearing, source, weight = measurement.bearing, measurement.source, min(new_s / _BEARING_S, 1.0)
     if isinstance(bearing, NotUsable) or bearing.at_edge or weight <= 0.0:
         return tuple(tracks)
-    # A wider one says that another peak may be the right one, which the chance of the loudest holds.
+    # A larger deviation means that another peak may be right; `_LOUDEST` already includes this chance.
     azimuth_rad, std_rad = bearing.azimuth_rad, min(bearing.std_rad, street.seen_std_rad)
     after = [one if one.source != source else _weighed(one, weight, 0.0) for one in tracks]
     ratios = [
@@ -87,6 +87,6 @@ def followed(
 
 
 def _weighed(track: SoundTrack, weight: float, ratio: float) -> SoundTrack:
-    """Return a track after a bearing that is so many times likelier of it than of any direction."""
+    """Return a track after a bearing, given the bearing's likelihood ratio to a random direction."""
     odds = track.existence / (1.0 - track.existence) * (1.0 - _LOUDEST + _LOUDEST * ratio) ** weight
     return replace(track, existence=min(odds / (1.0 + odds), _MOST))

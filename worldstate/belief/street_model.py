@@ -1,4 +1,4 @@
-"""The numbers of the belief about a street: each has a symbol, a unit and a source, and stands in a file."""
+"""Parameters of the belief over a street, from a file with a symbol, a unit and a source for each."""
 
 import json
 from collections.abc import Mapping
@@ -12,18 +12,18 @@ from worldstate.ground.serialisation import Layout, Via, decode
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number of a street model, and how it was found."""
+    """A number of a street model and its origin."""
 
     value: float
     symbol: str
     unit: str
     origin: Literal["fitted", "measured", "assumed", "given"]
-    why: str  # What chose it
+    why: str  # Reason for the value
 
 
 @dataclass(frozen=True, slots=True)
 class StreetNumbers:
-    """The numbers of a street model by their names, as a file holds them."""
+    """The numbers of a street model by name, as in a file."""
 
     LAYOUT: ClassVar = Layout("worldstate.StreetModel", "1.0.0")
 
@@ -36,16 +36,16 @@ _SHIPPED = decode(
 
 
 def number(name: str) -> Any:
-    """Return a field whose default is the number that ships."""
+    """Return a field whose default is the number in the shipped model."""
     return field(default=_SHIPPED.numbers[name].value)
 
 
 @dataclass(frozen=True, slots=True)
 class StreetModel:
-    """Numbers of the belief about the approach sides; without arguments those that ship.
+    """Parameters of the belief over the approach sides; the defaults are those that ship.
 
-    `described` holds what each is: its symbol, its unit, whether it was fitted, measured, assumed or given by
-    the caller, and what chose it.
+    `described` gives for each its symbol, unit and reason, and whether it was fitted, measured, assumed or
+    given by the caller.
 
     Raises
     ------
@@ -118,7 +118,7 @@ class StreetModel:
 
     @property
     def described(self) -> dict[str, Number]:
-        """Every number with its source, by its name."""
+        """Every number with its origin, by name."""
         pairs = ((name, one, getattr(self, name)) for name, one in self.sources.numbers.items())
         given = "given by the caller"
         return {
@@ -128,7 +128,7 @@ class StreetModel:
 
     @classmethod
     def of(cls, stored: StreetNumbers) -> "StreetModel":
-        """Return the model of a file: of a number that it does not hold, the one that ships."""
+        """Return the model of a file; numbers that are missing there have the shipped values."""
         told = {name: one for name, one in stored.numbers.items() if name in _SHIPPED.numbers}
         for name, one in told.items():
             if one.unit != (unit := _SHIPPED.numbers[name].unit):
@@ -141,5 +141,5 @@ def _stored(street: StreetModel) -> StreetNumbers:
     return StreetNumbers(street.described)
 
 
-# A street model as files and checkpoints hold it.
+# A street model in files and checkpoints.
 StoredStreet: TypeAlias = Annotated[StreetModel, Via(StreetNumbers, _stored, StreetModel.of)]

@@ -1,4 +1,4 @@
-"""The belief of the entities: each by itself, and all of them in columns, as a step reads and writes them."""
+"""Beliefs over the entities, one by one or as columns for a step of the filter."""
 
 import math
 from collections.abc import Sequence
@@ -30,54 +30,54 @@ from worldstate.ground.values import Answer
 from .site_geometry import IN_VIEW, SiteGeometry, normal_shares
 from .street_model import StreetModel
 
-# Of the name-based UUIDs below; any constant serves, but a change renames every entity of every recording.
+# Namespace of the UUIDs below; a change would rename every entity of every recording.
 _NAMESPACE = UUID("6f1d3c52-8a0e-5a6b-9d0f-3f6f0f6f5b11")
-NEVER_NS = np.iinfo(np.int64).min  # Of what was never seen
+NEVER_NS = np.iinfo(np.int64).min  # "Never seen" in a column
 
 
 Label: TypeAlias = Annotated[tuple[str, float], Keys(("label", "probability"))]
 Objects: TypeAlias = NDArray[np.object_]
 
 
-# Not frozen: a snapshot of twenty would take a tenth longer. Nothing writes into one.
+# Not frozen, because a snapshot of twenty would take a tenth longer. No code writes into a track.
 @dataclass(slots=True, eq=False)
 class Track:
     """Existence, motion, class and history of one entity."""
 
     id: str  # UUID for life
     existence: Probability
-    created_ns: int  # Birth and last measurement that moved it
-    updated_ns: int
-    # Index of the approach side that it is hidden on, came from, or first appeared nearest to.
+    created_ns: int  # Birth
+    updated_ns: int  # Last measurement that changed it
+    # Index of the approach side on which it is hidden, from which it came, or nearest to its first sighting.
     side: Count = 0
-    seen: bool = False  # Whether vision has it; before that its existence is a marginal of the belief
+    seen: bool = False  # Whether vision has found it; before, its existence is a marginal of the belief
     motion: MotionBelief = field(default=IN_VIEW, metadata=FLAT)  # Azimuth, rates, log range
     labels: tuple[Label, ...] = ((UNKNOWN, 1.0),)  # Class probabilities, sorted by label
-    moving: bool = True  # False for what vision holds for parked
+    moving: bool = True  # False if vision finds it parked
     sources: tuple[str, ...] = ()  # Modalities that contributed, sorted
-    last_seen_ns: int | None = None  # Last sighting
+    last_seen_ns: int | None = None
     answer: Answer = "unqueried"  # Last answer of the co-evidence channel about it
     miss_rate: Probability | None = None  # beta of that answer
     approach_heard: bool = False  # Whether its approach rate was ever measured
-    # P(it was hidden on its side): of one in view, that of the association at its hand-over.
+    # P(it was hidden on its side); for an entity in view, by the association at its hand-over.
     came_from: Probability = 0.0
-    place: CartesianBelief | None = None  # Then `motion` follows from it
+    place: CartesianBelief | None = None  # If there is one, `motion` follows from it
     behind: Probability = 1.0  # P(no line of sight to it | exists)
-    width_rad: float = 0.0  # Of its last box
-    # P(it is of a side | exists) of one only heard, whose side is not known; empty where it is.
+    width_rad: float = 0.0  # Width of its last box
+    # P(it is on a side | exists) for a sound-only entity of unknown side; otherwise empty.
     side_shares: tuple[Probability, ...] = ()
 
     @property
     def detected(self) -> bool:
-        """Whether a sensor or a message has told where it is: it was not only heard."""
+        """Whether a sensor or a message has located it; otherwise only its sound is known."""
         return self.seen or self.place is not None
 
 
 @dataclass(eq=False)
 class Tracks:
-    """All entities, in columns: row i of each is what a `Track` holds of entity i.
+    """All entities in columns: row i of each column belongs to entity i.
 
-    A step writes into a draft of its own. Shapes: (n,), means (n, 4), covariances (n, 4, 4).
+    A step writes into its own draft. Shapes: (n,), means (n, 4), covariances (n, 4, 4).
     """
 
     id: Objects
@@ -93,10 +93,10 @@ class Tracks:
     updated_ns: IntArray
     last_seen_ns: IntArray
     answer: Objects
-    miss_rate: FloatArray  # NaN where it was not asked
+    miss_rate: FloatArray  # NaN without an answer
     approach_heard: BoolArray
     came_from: FloatArray
-    placed: BoolArray  # Whether it has a place; where it has none the next two mean nothing
+    placed: BoolArray  # Whether it has a position; without one the next two columns are invalid
     place_mean: FloatArray
     place_covariance: FloatArray
     behind: FloatArray
@@ -131,19 +131,19 @@ class Tracks:
         return tuple(starmap(Track, zip(*[columns[name] for name in Track.__slots__], strict=True)))
 
     def row(self, number: int) -> Track:
-        """Return one of the entities by itself."""
+        """Return a single entity."""
         return self.taken([number]).rows()[0]
 
     def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":
-        """Return the columns of some of them."""
+        """Return the columns of some entities."""
         return Tracks(*[column[where] for column in vars(self).values()])
 
     def without(self, rows: Sequence[int]) -> "Tracks":
-        """Return the columns of all others."""
+        """Return the columns of all other entities."""
         return self.taken(np.delete(np.arange(len(self)), rows)) if rows else self
 
     def joined(self, rows: Sequence[Track]) -> "Tracks":
-        """Return the columns with some more entities at their end."""
+        """Return the columns with more entities at the end."""
         if not rows:
             return self
         pairs = zip(vars(self).values(), vars(Tracks.of(rows)).values(), strict=True)
@@ -155,25 +155,25 @@ class Tracks:
 
     @property
     def motion(self) -> MotionBelief:
-        """The motion of all."""
+        """The motion of all entities."""
         return MotionBelief(self.mean, self.covariance)
 
     @property
     def azimuth_std_rad(self) -> FloatArray:
-        """Standard deviations of their azimuths."""
+        """Standard deviations of the azimuths."""
         return np.asarray(np.sqrt(self.covariance[:, AZIMUTH, AZIMUTH]))
 
     @property
     def detected(self) -> BoolArray:
-        """Whether a sensor or a message has told where they are: they were not only heard."""
+        """Whether a sensor or a message has located each entity; otherwise only its sound is known."""
         return self.seen | self.placed
 
     def place(self, row: int) -> CartesianBelief | None:
-        """Return the place of one, None where it has none."""
+        """Return the position of an entity; None if it has none."""
         return CartesianBelief(self.place_mean[row], self.place_covariance[row]) if self.placed[row] else None
 
     def put(self, row: int, belief: MotionBelief | CartesianBelief) -> None:
-        """Give one of them a motion, or a place."""
+        """Set the motion or the position of an entity."""
         if isinstance(belief, MotionBelief):
             self.mean[row], self.covariance[row] = belief.mean, belief.covariance
         else:
@@ -182,7 +182,7 @@ class Tracks:
 
 
 _BELIEFS = ("mean", "covariance", "placed", "place_mean", "place_covariance")
-_UNKNOWN = {"last_seen_ns": NEVER_NS, "miss_rate": math.nan}  # What columns hold for None
+_UNKNOWN = {"last_seen_ns": NEVER_NS, "miss_rate": math.nan}  # Column values that stand for None
 _KINDS: dict[Any, Any] = {Objects: object, BoolArray: bool, IntArray: np.int64, FloatArray: float}
 _COLUMNS = {name: _KINDS[hint] for name, hint in get_type_hints(Tracks).items() if name not in _BELIEFS}
 _COLUMNS_OF = attrgetter(*_COLUMNS)
@@ -201,7 +201,7 @@ def entity_id(stream: str, kind: str, number: int) -> str:
 
 
 def born(kind: str, number: int, existence: float, stamp_ns: int, site: SiteGeometry) -> Track:
-    """Return the n-th entity of a kind, of which nothing else is known: what has found it follows."""
+    """Return the n-th entity of a kind, with defaults for everything else."""
     return Track(entity_id(site.settings.stream, kind, number), existence, stamp_ns, stamp_ns)
 
 
@@ -216,31 +216,32 @@ def after_empty_look(existence: NumbersT, miss_rate: NumbersT) -> NumbersT:
 
 
 def predict_tracks(tracks: Tracks, step_s: float, site: SiteGeometry) -> None:
-    """Move tracks on by a time step without a measurement."""
+    """Predict tracks over a time step without a measurement."""
     tracks.existence[tracks.seen] *= math.exp(-step_s / site.street.unseen_s)
     if True in tracks.placed:
         _drive_on(tracks, tracks.placed.nonzero()[0], step_s, site)
-    polar = ~tracks.placed  # Those that have just lost their place, too
+    polar = ~tracks.placed  # Includes those that have just lost their position
     if True in polar:
-        # All of them are read and written where they stand.
+        # A slice of all rows copies nothing.
         _relax(tracks, polar if False in polar else slice(None), step_s, site)
     occlude(tracks, site, step_s)
 
 
 def turn(tracks: Tracks, faster_rad_s: float) -> None:
-    """Turn tracks into the axes of an ego vehicle that now turns so much faster to the left."""
+    """Turn tracks into the axes of an ego vehicle whose yaw rate has risen by this much."""
     tracks.mean[tracks.seen & ~tracks.placed, AZIMUTH_RATE] -= faster_rad_s
 
 
 def _drive_on(tracks: Tracks, rows: IntArray, step_s: float, site: SiteGeometry) -> None:
-    """Move the places of tracks on by a step, and drop those that are lost."""
+    """Predict the positions of tracks, and drop positions that have become too uncertain."""
     before = CartesianBelief(tracks.place_mean[rows], tracks.place_covariance[rows])
     accelerations = acceleration_psd(tracks.moving[rows], site)
     after = predict_place(before, step_s, accelerations, site.ego_speed_mps, site.ego_yaw_rate_rad_s)
     tracks.place_mean[rows], tracks.place_covariance[rows] = after.mean, after.covariance
     for i, place in zip(rows.tolist(), after.each(), strict=True):
-        # No life time here: a sender that keeps sending is there, a silent one is lost within seconds.
-        # Twice as far as is published only the azimuth is tracked, or a hidden one's side.
+        # No lifetime is needed: a sender that keeps sending is there, and a silent one is lost within
+        # seconds. Above twice the published uncertainty only the azimuth is tracked, or the side of a hidden
+        # entity.
         if place.position_std_m > 2.0 * site.street.known_m:
             tracks.placed[i], tracks.behind[i] = False, 1.0
             if not tracks.seen[i]:
@@ -249,18 +250,18 @@ def _drive_on(tracks: Tracks, rows: IntArray, step_s: float, site: SiteGeometry)
 
 
 def acceleration_psd(moving: BoolArray, site: SiteGeometry) -> FloatArray:
-    """Return the densities of the white acceleration that entities move by, m^2/s^3."""
-    # A parked one must not drift with its boxes, but stay updatable.
+    """Return the densities of the entities' white acceleration, m^2/s^3."""
+    # A parked entity must not follow its boxes' noise, but its belief must stay updatable.
     return np.where(moving, site.street.acceleration, LEAST_STD)
 
 
 def _relax(tracks: Tracks, rows: BoolArray | slice, step_s: float, site: SiteGeometry) -> None:
-    """Move tracks without a place by a step, drawn to what is expected of vehicles in view or hidden."""
+    """Predict tracks without a position; they relax to the prior of vehicles in view or hidden."""
     seen = tracks.seen[rows]
     before = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
     motion = predict(before, step_s, acceleration_psd(tracks.moving[rows], site))
-    # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle still hidden has not passed the
-    # corner, whatever its last rates said.
+    # The azimuth relaxes to the hidden prior by P(hidden | exists): a vehicle that is still hidden has not
+    # passed the corner, whatever its last rates were.
     kept = np.exp(-step_s * np.where(seen, 0.0, tracks.behind[rows]) / site.settings.window_s)
     expected, of = site.expected, np.where(seen, -1, tracks.side[rows])
     towards = MotionBelief(expected.mean[of], expected.covariance[of])
@@ -269,7 +270,7 @@ def _relax(tracks: Tracks, rows: BoolArray | slice, step_s: float, site: SiteGeo
 
 
 def follow_places(tracks: Tracks, site: SiteGeometry) -> None:
-    """Give tracks the polar motion that follows from their places."""
+    """Compute the polar motion of tracks from their positions."""
     if True not in tracks.placed:
         return
     rows = tracks.placed.nonzero()[0]
@@ -279,17 +280,17 @@ def follow_places(tracks: Tracks, site: SiteGeometry) -> None:
 
 
 def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatArray:
-    r"""Return P(an occluder hides it) of every track, for each side's and each other track, shape (n, K + n).
+    r"""Return P(an occluder hides a track), for each side's occluder and each other track, shape (n, K + n).
 
     .. math:: P_k = \min\big(a_k,\ P + (1 - e^{-dt / T})\, (a_k n_k - P)_+\big)
 
-    with the chances P that it was hidden before, a that it stands at the azimuths of k, and n that k is
-    nearer: however a time is divided into steps, it is as likely hidden. Where a corner stands is known or
-    assumed; of two boxes the wider one is nearer as far as ranges and the spread of sizes allow. A box ends
-    where its corner begins: of an entity without a place the leading end counts.
+    with the chances P that it was hidden before, a that it is at the azimuths of k, and n that k is nearer.
+    The division of time into steps has no effect. The position of a corner is known or assumed; of two boxes
+    the wider one is nearer, as far as ranges and the spread of sizes allow. A corner cuts off the visible
+    box, so the leading end of the box is used for an entity without a position.
     """
     azimuth_rad, widths, sides = tracks.mean[:, AZIMUTH], tracks.width_rad, len(site.sides)
-    way = np.sign(tracks.mean[:, AZIMUTH_RATE]) * tracks.moving  # Of a first sighting none
+    way = np.sign(tracks.mean[:, AZIMUTH_RATE]) * tracks.moving  # 0 for a first sighting
     at = np.zeros((len(tracks), sides + len(tracks)))
     nearer = np.zeros_like(at)
     at[:, :sides] = site.past_edge(azimuth_rad + 0.5 * way * widths, tracks.azimuth_std_rad, way)
@@ -316,7 +317,7 @@ def occluded(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> FloatAr
 
 
 def occlude(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> None:
-    """Give the tracks that were detected the chance to be hidden that follows from where they are."""
+    """Set P(hidden) of the detected tracks from their azimuths and positions."""
     if True in tracks.detected:
         tracks.behind = np.where(tracks.detected, occluded(tracks, site, step_s).max(axis=1), tracks.behind)
 
@@ -324,7 +325,7 @@ def occlude(tracks: Tracks, site: SiteGeometry, step_s: float = 0.0) -> None:
 def relabelled(
     labels: tuple[Label, ...], seen_as: ClassShares, gain: float, least: float = 0.0
 ) -> tuple[Label, ...]:
-    """Return class probabilities after one detection, an exponential average over detections.
+    """Return class probabilities after one detection, as an exponential average over detections.
 
     Examples
     --------
@@ -338,18 +339,18 @@ def relabelled(
 
 
 def side_weights(track: Track, sides: int) -> tuple[float, ...]:
-    """Return P(an entity is of a side | exists), shape (sides,)."""
+    """Return P(an entity is on a side | exists), shape (sides,)."""
     known = tuple([float(k == track.side) for k in range(sides)])
     return known if track.detected or not track.side_shares else track.side_shares
 
 
 def heard_as(tracks: Tracks, row: int, kinds: ClassShares, street: StreetModel) -> tuple[Label, ...]:
-    """Return class probabilities after one more hop; what a detector once said, the ear does not change."""
+    """Return class probabilities after one more hop of sound; a class from a detector stays."""
     labels: tuple[Label, ...] = tracks.labels[row]
     is_heard = kinds and tracks.last_seen_ns[row] == NEVER_NS
     return relabelled(labels, kinds, street.label_gain, street.doubt) if is_heard else labels
 
 
 def merged(sources: tuple[str, ...], source: str) -> tuple[str, ...]:
-    """Return the sorted names of the sources with one more."""
+    """Return the sorted source names with one more."""
     return sources if source in sources else tuple(sorted((*sources, source)))

@@ -1,1 +1,1 @@
-"""Motion of one entity: modified polar and Cartesian coordinates with constant velocity."""
+"""Motion of one entity at constant velocity, in modified polar and in Cartesian coordinates."""

@@ -1,13 +1,13 @@
-r"""Constant velocity in Cartesian coordinates: entities whose position is measured, and the ego vehicle.
+r"""Constant velocity in Cartesian coordinates: entities with a measured position, and the ego vehicle.
 
 .. math:: x = (p_x,\; p_y,\; v_x,\; v_y)
 
-The position is that in `base_link`, the velocity that over ground along the same axes: with an ego speed u
-ahead, p moves by :math:`(v_x - u,\; v_y)\,dt`; where the ego turns, both turn the other way. The acceleration
+The position is in `base_link`; the velocity is over ground, along the same axes. With an ego speed u ahead, p
+changes by :math:`(v_x - u,\; v_y)\,dt`; if the ego vehicle turns, both turn the other way. The acceleration
 is white noise of density q, as in filterpy's `Q_continuous_white_noise`.
 
-The ego vehicle is dead-reckoned along arcs and set right by a localiser: with speed v and yaw rate omega it
-drives in a time t the chord
+The ego vehicle is dead-reckoned along arcs and corrected by a localiser. With speed v and yaw rate omega, the
+chord after a time t is
 
 .. math:: \Delta = v t\, \operatorname{sinc}\frac{\omega t}{2}
           \begin{pmatrix} \cos(\psi + \omega t / 2) \\ \sin(\psi + \omega t / 2) \end{pmatrix},
@@ -26,9 +26,9 @@ from worldstate.measurement import Odometry, Position
 
 from .motion import DIMENSIONS, LEAST_STD, GaussianBelief, MotionBelief, conditioned, white_acceleration
 
-# Polar coordinates are singular at the array itself, and no road user comes nearer than this.
+# Polar coordinates are singular at the array itself; no road user comes closer than this.
 _NEAREST_M = 1.0
-_LARGEST_PLACE_STD = 1.0 / LEAST_STD  # m and m/s: ten times the least sure position that is taken
+_LARGEST_PLACE_STD = 1.0 / LEAST_STD  # m and m/s: ten times the most uncertain position that is accepted
 _IDENTITY = np.eye(DIMENSIONS)
 NumbersT = TypeVar("NumbersT", float, FloatArray)
 
@@ -49,12 +49,12 @@ class CartesianBelief(GaussianBelief):
 
 
 def at_position(position: Position, speed_std_mps: float) -> CartesianBelief:
-    """Return the belief of an object that a first measurement places."""
+    """Return the belief over an object after its first measured position."""
     return CartesianBelief(*full_measurement(position, speed_std_mps))
 
 
 def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArray, FloatArray]:
-    """Return a measurement of all four components, an unknown velocity as 0 with a wide deviation."""
+    """Return a measurement of all four components; an unknown velocity is 0 with a wide deviation."""
     noise = np.diag([0.0, 0.0, speed_std_mps**2, speed_std_mps**2])
     known = len(position.covariance)
     noise[:known, :known] = position.covariance
@@ -62,7 +62,7 @@ def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArr
 
 
 def arc(speed_mps: float, yaw_rate_rad_s: float, step_s: NumbersT) -> tuple[FloatArray, NumbersT]:
-    """Return the chord of an arc in the axes at its beginning, shape (..., 2), and its turn."""
+    """Return the chord of an arc in the axes at its start, shape (..., 2), and the turn."""
     turned = yaw_rate_rad_s * step_s
     # numpy's sinc has a factor of pi.
     length = speed_mps * step_s * np.sinc(0.5 * turned / math.pi)
@@ -86,7 +86,7 @@ def predict_place(
 
     .. math:: m \leftarrow R(F m - u), \quad P \leftarrow R (F P F^T + Q) R^T
 
-    with u the chord that the ego vehicle drives, and R the turn of its axes the other way.
+    with the chord u of the ego vehicle, and the opposite turn R of its axes.
     """
     flow, noise = constant_velocity(step_s)
     mean = belief.mean @ flow.T
@@ -100,7 +100,7 @@ def predict_place(
 
 
 def update_position(belief: CartesianBelief, position: Position) -> CartesianBelief:
-    """Return the belief after a position, and a velocity where that was measured."""
+    """Return the belief after a position, with a velocity if that was measured."""
     known = len(position.covariance)
     measured = np.array([*position.position_m, *(position.velocity_mps or ())])
     return _update(belief, measured - belief.mean[:known], _IDENTITY[:known], np.array(position.covariance))
@@ -124,7 +124,7 @@ def polar_motion(
     """Return the belief in modified polar coordinates, to first order."""
     x, y, vx, vy = np.moveaxis(belief.mean, -1, 0)
     vx, r = vx - ego_speed_mps, np.hypot(x, y)
-    # Moved out to the nearest distance; an entity at the array itself is taken to be ahead of it.
+    # Moved out to the nearest distance; an entity at the array itself is assumed to be ahead of it.
     farther = _NEAREST_M / np.clip(r, TINY, _NEAREST_M)
     x, y = np.where(r > TINY, x * farther, _NEAREST_M), y * farther
     square = x * x + y * y
@@ -139,9 +139,9 @@ def polar_motion(
         (cosine, sine, none, none),
     )
     slope = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    # A sharp position far away would leave a covariance that is singular to rounding.
+    # A precise position far away would give a covariance that is singular to rounding.
     covariance = slope @ belief.covariance @ slope.mT + LEAST_STD**2 * _IDENTITY
-    # Axes that turn with the ego vehicle see everything turn the other way.
+    # In axes that turn with the ego vehicle, everything else turns the other way.
     seen_turning = turning - ego_yaw_rate_rad_s
     mean = np.stack([np.arctan2(y, x), seen_turning, closing, 0.5 * np.log(square)], axis=-1)
     return MotionBelief(mean, conditioned(covariance))
@@ -150,7 +150,7 @@ def polar_motion(
 def _update(
     belief: CartesianBelief, residual: FloatArray, slope: FloatArray, noise: FloatArray
 ) -> CartesianBelief:
-    """Return the belief after a measurement, in Joseph's form, which rounding leaves positive definite."""
+    """Return the belief after a measurement, in Joseph's form, which stays positive definite."""
     spread = slope @ belief.covariance
     gain = np.linalg.solve(spread @ slope.T + noise, spread).T
     keep = _IDENTITY - gain @ slope
@@ -175,9 +175,9 @@ _SQUARE = Via(FloatArray, np.ravel, lambda row: row.reshape(_POSE, _POSE))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EgoBelief:
-    """Gaussian over the pose (x, y, yaw) in the map frame, and the twist that holds.
+    """Gaussian over the pose (x, y, yaw) in the map frame, with the present twist.
 
-    Shapes: pose (3,), covariance (3, 3). It is `localised` once odometry has told a pose.
+    Shapes: pose (3,), covariance (3, 3). It is `localised` once odometry has given a pose.
     """
 
     pose: Annotated[FloatArray, _ROW]
@@ -210,7 +210,7 @@ def driven(ego: EgoBelief, step_s: float) -> EgoBelief:
 
 
 def corrected(ego: EgoBelief | None, told: Odometry) -> EgoBelief:
-    """Return the ego vehicle as odometry has it: its twist, and its pose where that was told."""
+    """Return the ego vehicle after odometry: with its twist, and its pose if there is one."""
     before = ego or EgoBelief(np.zeros(_POSE), np.zeros((_POSE, _POSE)), 0.0, 0.0, 0.0, 0.0)
     pose, covariance = before.pose, before.covariance
     if told.pose is not None:

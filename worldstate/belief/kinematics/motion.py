@@ -1,16 +1,16 @@
 r"""Gaussians over the motion of entities: an extended Kalman filter in modified polar coordinates.
 
-Constant velocity seen from a standing ego has the state
+Constant velocity relative to an ego vehicle at rest has the state
 
 .. math:: x = (\theta,\; \dot\theta,\; \rho = \dot r / r = -1/\mathrm{TTA},\; \log r)
 
-Bearing and looming are linear in it, and the range, which neither of them tells, stands apart. In complex
+Bearing and looming are linear in it. Neither of them measures the range, which is separate. In complex
 numbers :math:`u = \log r + i\theta` and :math:`w = \rho + i\dot\theta`
 
 .. math:: \dot u = w, \quad \dot w = -w^2, \qquad\text{so that}\qquad
           u' = u + \log z, \quad w' = w / z, \quad z = 1 + w t
 
-where z is where the vehicle stands after a time t, in units of the first range and from its bearing.
+with z the place of the vehicle after a time t, in units of the first range and relative to its bearing.
 
 References
 ----------
@@ -31,7 +31,7 @@ from worldstate.ground.serialisation import Via
 DIMENSIONS = 4
 AZIMUTH, AZIMUTH_RATE, RADIAL_RATE, LOG_RANGE = range(DIMENSIONS)
 
-_Numbers: TypeAlias = float | FloatArray  # Of one belief, or of each of many
+_Numbers: TypeAlias = float | FloatArray  # One value, or one per belief
 
 
 def propagate(state: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]:
@@ -39,7 +39,7 @@ def propagate(state: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]
 
     .. math:: \frac{du'}{dw} = \frac{t}{z}, \qquad \frac{dw'}{dw} = \frac{1}{z^2}
 
-    Shapes: state (..., 4), as the first that is returned; (..., 4, 4).
+    Shapes: state (..., 4), like the first result; the second is (..., 4, 4).
     """
     w = state[..., RADIAL_RATE] + 1j * state[..., AZIMUTH_RATE]
     z = 1.0 + w * step_s
@@ -58,13 +58,13 @@ def propagate(state: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]
 
 
 def process_noise(acceleration_psd: _Numbers, range_m: _Numbers, step_s: float) -> FloatArray:
-    r"""Return Q, shape (..., 4, 4), of a white acceleration: at range r it turns and closes by a/r."""
+    r"""Return Q, shape (..., 4, 4), of a white acceleration a, which changes both rates by a/r at range r."""
     strength = np.asarray(acceleration_psd / np.square(range_m))
     return np.asarray(strength[..., None, None] * _unit_noise(step_s))
 
 
 def white_acceleration(step_s: float) -> FloatArray:
-    """Return the covariance of place and speed after a white acceleration of density 1, shape (2, 2)."""
+    """Return the covariance of place and speed for a white acceleration of density 1, shape (2, 2)."""
     return np.array([[step_s**3 / 3.0, step_s**2 / 2.0], [step_s**2 / 2.0, step_s]])
 
 
@@ -76,27 +76,27 @@ def _unit_noise(step_s: float) -> FloatArray:
 
 
 def _checked_covariance(row: FloatArray) -> FloatArray:
-    """Return the covariance that a checkpoint holds as one row."""
+    """Return the covariance from the row of a checkpoint."""
     covariance = row.reshape(DIMENSIONS, DIMENSIONS)
     if not (covariance == covariance.T).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        raise InvalidArgumentError("expected it symmetric and positive definite")
+        raise InvalidArgumentError("expected a symmetric positive definite matrix")
     return covariance
 
 
-# No sensor knows a bearing to .006 degrees or an approach rate to 1e-4 1/s. Deviations below make a
-# covariance singular to rounding, and its checkpoint is refused; a hundred radians say nothing.
+# No sensor measures a bearing to 0.006 degrees or an approach rate to 1e-4 1/s. Smaller deviations make a
+# covariance singular to rounding, and its checkpoint is refused; a hundred radians contain no information.
 LEAST_STD, LARGEST_STD = 1e-4, 1e2
-# Of the largest variance, what every one has at least, so that rounding, 1e-16 of it, leaves none below zero.
+# The least variance as a share of the largest, so that rounding, 1e-16 of it, leaves none below zero.
 _CONDITION = 0.1 * TINY
 
 
 def conditioned(covariance: FloatArray, largest_std: float = LARGEST_STD) -> FloatArray:
-    r"""Return a covariance symmetric and positive definite, whatever rounding has left of it.
+    r"""Return a covariance that is symmetric and positive definite in spite of rounding.
 
     .. math:: P \leftarrow S P S + \kappa \max_i (S P S)_{ii}\, I, \qquad
               s_i = \min(1,\ \sigma_{max} / \sigma_i)
 
-    A deviation above the largest one says nothing, but leaves no digits to the others.
+    A deviation above the largest one has no information but would cost the others their digits.
     """
     covariance = 0.5 * (covariance + covariance.mT)
     # A view of the diagonals.
@@ -114,8 +114,8 @@ def conditioned(covariance: FloatArray, largest_std: float = LARGEST_STD) -> Flo
 class GaussianBelief:
     """Mean and covariance of four coordinates.
 
-    Shapes: mean (4,), covariance (4, 4) symmetric and positive definite, or with leading axes of many
-    entities: with twenty a step takes half the time when all are predicted and updated at once.
+    Shapes: mean (4,), covariance (4, 4) symmetric and positive definite. For many entities both have leading
+    axes: with twenty, a step takes half the time if all are predicted and updated at once.
     """
 
     mean: Annotated[FloatArray, Via(FloatArray, np.asarray, lambda row: row.reshape(DIMENSIONS))]
@@ -128,16 +128,16 @@ class GaussianBelief:
         return cls(np.reshape([one.mean for one in beliefs], (-1, DIMENSIONS)), covariance)
 
     def each(self) -> list[Self]:
-        """Return the beliefs that were stacked."""
+        """Return the beliefs of a stack one by one."""
         return list(map(type(self), self.mean, self.covariance))
 
 
-# Range only scales the angular noise of an acceleration, and bearings from a standing ego do not measure it:
-# outside these limits the noise would vanish or throw the bearing.
+# The range only scales the angular noise of an acceleration, and bearings from an ego at rest do not measure
+# it. Outside these limits the noise would vanish or dominate the bearing.
 NEAREST_M, FARTHEST_M = 3.0, 200.0
 _LOG_NEAREST, _LOG_FARTHEST = math.log(NEAREST_M), math.log(FARTHEST_M)
-# Within one step a vehicle comes no closer than half its range: closer, the closed form passes through the
-# array.
+# Within one step a vehicle comes no closer than half its range; below that, the closed form passes through
+# the array.
 _CLOSEST_SHARE = 0.5
 
 
@@ -150,7 +150,7 @@ class MotionBelief(GaussianBelief):
 
     @classmethod
     def around(cls, mean: Sequence[float], std: Sequence[float]) -> "MotionBelief":
-        """Return independent components."""
+        """Return a belief with independent components."""
         return cls(np.array(mean), np.diag(np.square(np.clip(std, LEAST_STD, LARGEST_STD))))
 
     @property
@@ -181,8 +181,8 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: _Numbers) -> 
     """
     start = belief.mean.copy()
     start[..., RADIAL_RATE] = np.maximum(start[..., RADIAL_RATE], -_CLOSEST_SHARE / max(step_s, TINY))
-    # Clipped before exp: approach rates that contradict each other drive log r, which is not measured, so far
-    # that exp overflows.
+    # Clipped before exp: contradictory approach rates can drive log r, which is not measured, so far that exp
+    # overflows.
     range_m = np.exp(np.minimum(np.maximum(belief.mean[..., LOG_RANGE], _LOG_NEAREST), _LOG_FARTHEST))
     mean, flow = propagate(start, step_s)
     covariance = flow @ belief.covariance @ flow.mT + process_noise(acceleration_psd, range_m, step_s)
@@ -192,15 +192,15 @@ def predict(belief: MotionBelief, step_s: float, acceleration_psd: _Numbers) -> 
 def relax(
     belief: MotionBelief, towards: MotionBelief, bearing_kept: _Numbers, radial_kept: _Numbers
 ) -> MotionBelief:
-    r"""Return the belief drawn towards another, as an Ornstein-Uhlenbeck process draws it.
+    r"""Return the belief relaxed towards another one by an Ornstein-Uhlenbeck process.
 
     .. math:: m \leftarrow m_0 + \Phi (m - m_0), \quad P \leftarrow \Phi P \Phi + (I - \Phi^2) P_0
 
     with :math:`\Phi` diagonal, `bearing_kept` for (theta, theta_dot) and `radial_kept` for (rho, log r), and
     P_0 diagonal.
     """
-    # Constant velocity alone would move a hidden vehicle out of its occlusion without evidence or, at a
-    # constant bearing without a measured range, through the array.
+    # Without relaxation a hidden vehicle would leave its occlusion without evidence or, at a constant bearing
+    # and unmeasured range, pass through the array.
     phi = np.empty_like(belief.mean)
     phi[..., :RADIAL_RATE] = np.asarray(bearing_kept)[..., None]
     phi[..., RADIAL_RATE:] = np.asarray(radial_kept)[..., None]
@@ -211,11 +211,11 @@ def relax(
 
 
 def _expected(belief: MotionBelief, row: int, ago_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the mean of a component as it was some time ago, its covariance with the state, its variance."""
+    """Return a component's earlier mean, its covariance with the state, and its variance."""
     mean, column = belief.mean[..., row], belief.covariance[..., row]
     if not ago_s:
         return mean, column, column[..., row]
-    rate = row + 1  # The azimuth's; no other component is measured late
+    rate = row + 1  # Only the azimuth is measured late, and its rate is the next component
     column = column - ago_s * belief.covariance[..., rate]
     return mean - ago_s * belief.mean[..., rate], column, column[..., row] - ago_s * column[..., rate]
 
@@ -223,7 +223,7 @@ def _expected(belief: MotionBelief, row: int, ago_s: float) -> tuple[FloatArray,
 def log_azimuth_likelihood(
     belief: MotionBelief, azimuth_rad: float, std_rad: _Numbers, ago_s: float = 0.0
 ) -> FloatArray:
-    """Return log N(z; h m, h P h^T + R) of a bearing of some time ago, residual wrapped, nats per rad."""
+    """Return log N(z; h m, h P h^T + R) of an earlier bearing, residual wrapped, nats per rad."""
     mean, _, variance = _expected(belief, AZIMUTH, ago_s)
     variance = variance + np.square(std_rad)
     residual = wrap_angle(azimuth_rad - mean)
@@ -238,10 +238,10 @@ def update(
     weight: _Numbers = 1.0,
     ago_s: float = 0.0,
 ) -> MotionBelief:
-    r"""Return the belief after one component was measured, of this entity with probability w.
+    r"""Return the belief after a measurement of one component, which is of this entity with probability w.
 
-    Probabilistic data association: a bearing is one of AZIMUTH, an approach rate -1/TTA one of RADIAL_RATE. A
-    bearing of `ago_s` ago measures :math:`h^T m = \theta - t\dot\theta`.
+    Probabilistic data association: a bearing measures AZIMUTH, an approach rate -1/TTA measures RADIAL_RATE.
+    A bearing from `ago_s` ago measures :math:`h^T m = \theta - t\dot\theta`.
 
     .. math:: m = m^- + w K\nu, \quad P = w P^+ + (1 - w) P^- + w (1 - w)\, K\nu\nu^T K^T,
         \quad K = P^- h / (h^T P^- h + R)
@@ -252,8 +252,8 @@ def update(
     if row == AZIMUTH:
         residual = wrap_angle(residual)
     gain = column / (variance[..., None] + noise)
-    # Joseph's form stays positive definite where P - K H P loses it to rounding: a sharp bearing on a belief
-    # that is sharp already. Of one component it is two outer products.
+    # Joseph's form stays positive definite; P - K H P does not if both the bearing and the belief are
+    # precise. For one component it is two outer products.
     swept = belief.covariance - _outer(gain, column)
     crossed = column - gain * variance[..., None]
     updated = swept - _outer(crossed, gain) + noise[..., None] * _outer(gain, gain)
