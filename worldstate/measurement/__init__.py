@@ -1,4 +1,4 @@
-"""Measurements that adapters pass to the filter, and the protocols of a modality."""
+"""Measurements from adapters to the filter, and the protocols of a modality."""
 
 import lazy_loader
 

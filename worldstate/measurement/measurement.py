@@ -25,8 +25,8 @@ _SIGHTING = {
     "width_rad": (0.0, math.tau),
     "moving": bool,
 }
-MOST_LOOKS = 32  # Cameras of a car
-_MOST_SIGHTINGS = 100_000  # The filter counts 64 of them
+MOST_LOOKS = 32  # Number of cameras of a car
+_MOST_SIGHTINGS = 100_000  # The filter uses at most 64 of them
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +38,11 @@ class Bearing:
     azimuth_rad : float
         In (-pi, pi], left positive, in `base_link`.
     std_rad : float
-        Standard deviation of a line-of-sight source; a hidden one has a measurement model of its own.
+        Standard deviation for a line-of-sight source; a hidden one has its own measurement model.
     prominence : float
-        Peak-to-median ratio of the spatial spectrum the bearing was read from, >= 1.
+        Peak-to-median ratio of the spatial spectrum, >= 1.
     at_edge : bool
-        Whether it stands at the edge of the sector that was searched: the source may lie beyond it.
+        Whether the peak is at the edge of the searched sector, so that the source may be beyond it.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class Bearing:
 
     azimuth_rad: float
     std_rad: float
-    prominence: float = 1.0  # Of a flat spectrum: claims nothing
+    prominence: float = 1.0  # A flat spectrum, which contains no information
     at_edge: bool = field(default=False, metadata=ADDED)
 
     def __post_init__(self) -> None:
@@ -68,7 +68,7 @@ class Bearing:
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """A measured approach rate: the reciprocal time-to-arrival 1/TTA = -r_dot/r.
+    """A measured approach rate: the reciprocal time to arrival 1/TTA = -r_dot/r.
 
     Parameters
     ----------
@@ -97,23 +97,23 @@ class Approach:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """How well could be heard, as a look says what was searched.
+    """How likely a hidden vehicle would have been detected in a hop of sound, and the reason.
 
     Parameters
     ----------
     share : float
-        Probability that a hidden vehicle would have been noticed, in [0, 1].
+        P(a hidden vehicle would have been noticed), in [0, 1].
     reason : str or None
-        Why it would not: "lost samples", "clipped", "noise far above this place's usual", "wind", "dead
-        channels", "loud source in view", "a sound that the models do not know" or a speed of the ego that
-        they did not learn; None where nothing is against it.
+        Why it is low: "lost samples", "clipped", "noise far above this place's usual", "wind", "dead
+        channels", "loud source in view", "a sound that the models do not know", or an ego speed outside the
+        training data; None if nothing reduces it.
     excess_db : float
-        How far the sound lies above what is usual at this place, dB.
+        Level of the sound above what is usual at this place, dB.
     measured : bool
-        False where nothing measures the share; the snapshot then states none.
+        False if nothing measures the share; the snapshot then contains none.
     kinds : mapping of str to float, or None
-        Of each kind of road user, the share that is noticed if all else is as in the exam of the model; None
-        if none was counted.
+        For each kind of road user, the noticed share under the conditions of the model's exam; None if it was
+        not measured.
 
     Raises
     ------
@@ -134,7 +134,7 @@ class Heard:
 
     @property
     def usable(self) -> bool:
-        """Whether the hop is read at all: below a fifth what it does not hold says nothing."""
+        """Whether the hop is used as evidence; below a fifth, silence has no meaning."""
         return self.share >= LEAST_HEARD
 
     def __post_init__(self) -> None:
@@ -146,7 +146,7 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One object that the co-evidence channel detects.
+    """One object that the co-evidence channel has detected.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ class Sighting:
     std_rad : float
         Standard deviation of the azimuth.
     label : str
-        Class name, in the library's words if it is of a known data set.
+        Class name; for known data sets, the library's name of the class.
     score : float
         Detector confidence in [0, 1].
     width_rad : float
@@ -179,7 +179,7 @@ class Sighting:
     label: str
     score: float
     width_rad: float = 0.0
-    moving: bool = True  # A single image cannot tell
+    moving: bool = True  # A single image does not show motion
 
     def __post_init__(self) -> None:
         check_fields(self, **_SIGHTING)
@@ -187,20 +187,20 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One search of a sensor through all that it sees: it counts once, whatever carries it.
+    """One search of a sensor's whole view, which is used once, however many measurements contain it.
 
     Parameters
     ----------
     sensor : str
-        Name of the sensor that looked.
+        Name of the sensor.
     stamp_ns : int
-        When it looked, nanoseconds on the stream's clock: of an image, when it was taken.
+        Time of the search, nanoseconds on the stream's clock; for an image, when it was taken.
     answer : Present, Absent or Unqueried
-        Whether anything that moves is in view, with the miss and the clutter rate of the whole view.
+        Whether any moving object is in view, with the miss rate and the clutter rate of the whole view.
     sector_rad : (float, float) or None
-        Where it looked: from this azimuth to the left until that one. None for the view of the context.
+        The searched sector, from its right end to its left end. None for the view of the context.
     fault : str or None
-        What is known to be wrong with the sensor, in words; the snapshot says it.
+        Known fault of the sensor, in words; it appears in the snapshot.
 
     Raises
     ------
@@ -230,14 +230,14 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class CameraLook:
-    """A look with all that it has found: of one camera of a car that has several.
+    """A look of one of several cameras, with its sightings.
 
     Parameters
     ----------
     look : Look
         The search, with its own sector.
     sightings : tuple of Sighting
-        All that the camera reports.
+        All detections of the camera.
 
     Raises
     ------
@@ -290,27 +290,26 @@ class Measurement:
     co_evidence : CoEvidence
         Present, Absent or Unqueried.
     bearing, approach : Bearing or Approach, or NotUsable
-        Marginalised where not usable.
+        NotUsable if it is missing; a filter must marginalise over it.
     sightings : tuple of Sighting
-        All that the co-evidence channel reports, in the queried sector or not.
+        All detections of the co-evidence channel, inside and outside the queried sector.
     look : Look or None
-        The search that co-evidence and sightings come from; None takes them for one of the source's own, made
-        at the stamp.
+        The search behind co-evidence and sightings; None means a search by the source itself at the stamp.
     further : tuple of CameraLook
-        Looks of further cameras, each with its own sector; the co-evidence is then what all of them say
-        together of the sector of the sound.
+        Looks of further cameras, each with its own sector. The co-evidence is then the joint answer of all
+        cameras for the sector of the sound.
     domain : Familiar, Foreign, WarningSignal or None
-        Whether the model was made for what was heard; None where nothing tells.
+        Whether the sound belongs to the model's domain; None if that is unknown.
     kinds : tuple of (str, float)
-        Classes of what is heard with their probabilities, sorted by name; empty where nothing tells.
+        Classes of the sound with their probabilities, sorted by name; empty if unknown.
     sequence : SequenceReading, NotUsable or None
-        What the last seconds say of vehicles that come into view; None of a modality that has no such model.
+        Evidence of the last seconds about vehicles that come into view; None without such a model.
     source : str
         Name of the modality.
     fault : str or None
-        What is known to be wrong with the sensor, in words; the snapshot says it.
+        Known fault of the sensor, in words; it appears in the snapshot.
     heard : Heard
-        How likely a hidden vehicle would have been noticed. Of a modality without masking, 1.
+        How likely a hidden vehicle would have been noticed; 1 for a modality without masking.
 
     Raises
     ------
@@ -327,7 +326,7 @@ class Measurement:
     ('v2x', 'not measured')
     """
 
-    # Written without a kind, as in checkpoints of before there were scans of positions.
+    # Written without a kind, like checkpoints from before scans of positions existed.
     LAYOUT: ClassVar = Layout()
 
     stamp_ns: int
@@ -340,8 +339,8 @@ class Measurement:
     domain: DomainVerdict | None = None
     kinds: ClassShares = ()
     sequence: SequenceReading | NotUsable | None = None
-    # Overlap is discounted within a source and evidence multiplied across sources: two with one name would
-    # count as one that repeats itself.
+    # Overlap is discounted within a source, and evidence is multiplied across sources. Two sources with one
+    # name would be treated as one that repeats itself.
     source: str = "acoustic"
     fault: str | None = None
     further: tuple[CameraLook, ...] = field(default=(), metadata=ADDED)
@@ -357,7 +356,7 @@ class Measurement:
 
     @property
     def looks(self) -> tuple[CameraLook, ...]:
-        """All looks in the order of their sensors, its own first among equals; order carries no meaning."""
+        """All looks in the order of their sensors; among equals the measurement's own look is first."""
         own = self.look or Look(self.source, self.stamp_ns, self.co_evidence)
         return tuple(sorted((CameraLook(own, self.sightings), *self.further), key=_BY_SENSOR))
 
@@ -368,20 +367,20 @@ Side = Literal["left", "right"]
 
 
 class MeasurementAdapter(Protocol[RawT]):
-    """Turns raw input of one modality into measurements; generic in what it takes.
+    """Converts raw input of one modality into measurements; generic in the type of its input.
 
-    The acoustic adapter takes blocks of samples, a radar one would take sweeps. To write one for another
-    modality:
+    The acoustic adapter takes blocks of samples; a radar adapter would take sweeps. Rules for an adapter of
+    another modality:
 
-    - Take any amount of raw input per call and return the measurements that became complete with it: none,
-      one or many, in the order of their stamps. Cutting the input elsewhere must not change them.
-    - Stamp each with the end of the interval that it observed, integer nanoseconds on the stream's clock.
-    - Give evidence as log-likelihoods under hidden (one per direction), visible and none, up to a common
-      constant. A modality that cannot tell hidden from visible gives both the same value.
-    - Say `Unqueried` where no co-evidence channel was asked, and `NotUsable` with the reason for a bearing or
-      an approach rate that cannot be given. Never put 0 or NaN in their place.
-    - Say in `heard` how likely a hidden vehicle would have been noticed, where that is less than 1.
-    - Azimuth is in `base_link`, radians, left positive, in (-pi, pi]. Convert here, nowhere else.
+    - Take any amount of raw input per call, and return the measurements that it completes: none, one or many,
+      in the order of their stamps. Other cuts of the input must not change them.
+    - The stamp is the end of the observed interval, integer nanoseconds on the stream's clock.
+    - Evidence consists of log-likelihoods under hidden (one per direction), visible and none, up to a common
+      constant. A modality that does not separate hidden from visible gives both the same value.
+    - Return `Unqueried` if no co-evidence channel was queried, and `NotUsable` with the reason for a missing
+      bearing or approach rate. Never use 0 or NaN instead.
+    - Set `heard` to P(a hidden vehicle would have been noticed) if that is less than 1.
+    - Azimuth is in `base_link`, radians, left positive, in (-pi, pi]. Convert it here and nowhere else.
     - Check raw input once, here, and raise the typed errors of `worldstate.errors`.
 
     Attributes
@@ -405,14 +404,14 @@ class MeasurementAdapter(Protocol[RawT]):
     source: str
 
     def measure(self, block: RawT, /) -> list[Measurement]:
-        """Take the next piece of raw input; return the measurements completed by it, oldest first."""
+        """Process the next piece of raw input; return the measurements that it completes, oldest first."""
         ...
 
 
 class CoEvidenceChannel(Protocol):
     """A channel that searches a sector for the co-evidence that a signature predicts.
 
-    `adapters.camera.vision_query.VisionQuery` is one, over recorded detections; a live detector is another.
+    `adapters.camera.vision_query.VisionQuery` does this on recorded detections.
 
     Examples
     --------
@@ -433,7 +432,7 @@ class CoEvidenceChannel(Protocol):
         expected_labels: Collection[str] | None = None,
         side: Side | None = None,
     ) -> CoEvidence:
-        """Search the sector around the bearing, or a whole side; None expects the channel's usual classes."""
+        """Search the sector around the bearing, or a whole side; without labels, for the usual classes."""
         ...
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
@@ -441,5 +440,5 @@ class CoEvidenceChannel(Protocol):
         ...
 
     def last_look(self, stamp_ns: int) -> Look | None:
-        """Return the search of the whole view that counts at this instant, None where there was none."""
+        """Return the search of the whole view that applies at this instant; None without one."""
         ...

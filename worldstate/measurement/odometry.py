@@ -1,4 +1,4 @@
-"""Odometry: how the ego vehicle moves, and where it is, as wheels, an inertial unit or a localiser say it."""
+"""Odometry: motion and pose of the ego vehicle from wheels, an inertial unit or a localiser."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from worldstate.ground import integer_ns, named, wrap_angle
 from worldstate.ground.checks import check_fields, pair
 
 FARTHEST_M = 1e8  # UTM's northings go up to 1e7
-_MOST_TURNS_RAD = 1e6  # Of a localiser that counts on
+_MOST_TURNS_RAD = 1e6  # Large enough for a localiser that does not wrap its yaw
 _ABOVE_ZERO = math.ulp(0.0)
 _RANGES = {
     "speed_mps": (-100.0, 100.0),
@@ -19,16 +19,16 @@ _RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class EgoPose:
-    """Where the ego vehicle is in the map frame: that in which the corners of the context stand.
+    """Pose of the ego vehicle in the map frame, in which the context gives its corners.
 
     Parameters
     ----------
     position_m : (float, float)
-        Of `base_link`, m.
+        Position of `base_link`, m.
     yaw_rad : float
-        Its x axis, counter-clockwise from that of the map; wrapped into (-pi, pi] where it is beyond.
+        Angle of its x axis, counter-clockwise from that of the map; wrapped into (-pi, pi].
     position_std_m, yaw_std_rad : float
-        Standard deviations, of the position along either axis.
+        Standard deviations; that of the position is per axis.
 
     Examples
     --------
@@ -51,23 +51,23 @@ class EgoPose:
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """Twist of the ego vehicle, and its pose where a localiser tells it.
+    """Twist of the ego vehicle, and its pose if a localiser measures it.
 
-    It holds until the next one: between two the ego vehicle drives an arc. Without a pose the arcs are added
-    up from where the first one found it, which is the origin of the map.
+    The twist holds until the next message, so the ego vehicle drives an arc between two messages. Without a
+    pose the arcs are added up from the first message, whose place is the origin of the map.
 
     Parameters
     ----------
     source : str
         Name of the sensor.
     stamp_ns : int
-        When it moved so, ns on the stream's clock.
+        Time of the twist, ns on the stream's clock.
     speed_mps, yaw_rate_rad_s : float
-        Along the x axis of `base_link`, and about its z axis, left positive.
+        Speed along the x axis of `base_link`, and yaw rate about its z axis, left positive.
     speed_std_mps, yaw_rate_std_rad_s : float
         Standard deviations.
     pose : EgoPose or None
-        In place of what was added up.
+        Pose that replaces the sum of the arcs.
 
     Raises
     ------
@@ -84,8 +84,8 @@ class Odometry:
     stamp_ns: int
     speed_mps: float
     yaw_rate_rad_s: float = 0.0
-    speed_std_mps: float = 0.1  # Of wheel encoders at town speeds
-    yaw_rate_std_rad_s: float = 0.01  # Of an automotive gyroscope with its bias
+    speed_std_mps: float = 0.1  # Typical of wheel encoders at town speeds
+    yaw_rate_std_rad_s: float = 0.01  # Typical of an automotive gyroscope with its bias
     pose: EgoPose | None = None
 
     def __post_init__(self) -> None:

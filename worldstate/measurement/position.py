@@ -1,4 +1,4 @@
-"""Positions: what a radar, a lidar or a radio message says of where road users are."""
+"""Positions of road users from a radar, a lidar or radio messages."""
 
 from dataclasses import dataclass
 
@@ -9,36 +9,36 @@ from worldstate.abduction.road_users import ClassShares, class_shares
 from worldstate.ground import InvalidArgumentError, finite_array, in_range, integer_ns, named, nanoseconds
 from worldstate.ground.checks import all_of, check_fields, pair
 
-# Bounds of what is taken: farther away nothing matters within the times that the filter speaks of, and beyond
-# these deviations a covariance is singular to rounding or says nothing.
+# Limits of accepted values: farther objects have no effect within the horizons of the filter. Outside these
+# variances a covariance is singular to rounding or contains no information.
 _FARTHEST_M, _FASTEST_MPS = 1e4, 200.0
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-6, 1e6
-# A scan is associated as a whole, at a cost that grows with the cube of its size.
+# A scan is associated as a whole, and the time for this grows with the cube of its size.
 MOST_POSITIONS = 128
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where one object is, as a sensor or a message states it, in `base_link`.
+    """Position of one object in `base_link`, from a sensor or a message.
 
     Parameters
     ----------
     position_m : (float, float)
         x forward and y left, m.
     covariance : nested tuple of floats, shape (2, 2) or (4, 4)
-        Of (x, y), m^2; of (x, y, vx, vy) where a velocity is given. Symmetric and positive definite.
+        Of (x, y), m^2, or of (x, y, vx, vy) with a velocity. Symmetric and positive definite.
     velocity_mps : (float, float) or None
-        Over ground, along x and y.
+        Velocity over ground, along x and y.
     existence_probability : float
-        Probability that there is such an object, as the sensor or the sender's credentials say it, in (0, 1);
-        0.5 where nothing tells.
+        P(the object exists) according to the sensor, or to the credentials of the sender, in (0, 1); 0.5 if
+        unknown.
     classes : tuple of (str, float)
-        Classes with their probabilities, empty where nothing tells.
+        Classes with their probabilities; empty if unknown.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is not finite or out of range, or the covariance is no covariance of what is given.
+        If a number is not finite or out of range, or the covariance is invalid or has the wrong size.
 
     Examples
     --------
@@ -76,18 +76,18 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class SearchedSector:
-    """Where a sensor has looked: what stands there in line of sight it would have found.
+    """The sector in which a sensor would have detected objects in line of sight.
 
     Parameters
     ----------
     sector : Sector
         Azimuths of its field of view.
     range_m : float
-        How far it sees.
+        Largest range of detection.
     detection_probability : float
         Probability that it detects a road user there in one scan, in [0, 1).
     clutter_rate : float
-        Probability that a detection is of nothing, in (0, 1).
+        Probability that a detection is false, in (0, 1).
 
     Examples
     --------
@@ -116,21 +116,21 @@ class SearchedSector:
 
 @dataclass(frozen=True, slots=True)
 class PositionScan:
-    """All positions that one source states at one instant, and where it has searched.
+    """All positions from one source at one instant, and the searched sector.
 
     Parameters
     ----------
     source : str
         Name of the sensor or of the receiver.
     stamp_ns : int
-        When the objects were there, ns on the stream's clock; with a latency, when the scan came.
+        Time of the positions, ns on the stream's clock; with a latency, the arrival of the scan.
     positions : tuple of Position
         At most 128.
     searched : SearchedSector or None
-        What a sensor in line of sight has searched: an empty scan of it is evidence of absence. None of
-        messages, which come round corners, and say nothing of vehicles that send none.
+        Sector that a sensor in line of sight has searched; its empty scan is evidence of absence. None for
+        messages: these need no line of sight and give no evidence about vehicles that send none.
     latency_s : float
-        How long before its stamp the scan was taken.
+        Time from the scan to its stamp.
 
     Raises
     ------
