@@ -1,4 +1,4 @@
-"""The past corrected: a fixed-lag smoother over entities, beside the filter."""
+"""Fixed-lag smoother over entities, which corrects past states beside the filter."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""Factors of the graph: motion, and what is measured of an entity.
+"""Factors of the graph: motion, and measurements of an entity.
 
-All with a Python error function are made in one place, which checks their shapes.
+All factors with a Python error function are built in one place, which checks their shapes.
 """
 
 import math
@@ -17,22 +17,22 @@ from worldstate.measurement import Approach, Bearing, Position
 
 from .observations import AngularHeight, Range, SmoothingSettings, azimuth, cartesian, closing_rate, log_range
 
-# gtsam itself has no types that mypy could read without 25,000 lines of stubs.
+# Type stubs of gtsam for mypy would take 25,000 lines.
 Factor: TypeAlias = Any
 NoiseModel: TypeAlias = Any
-# Error and its derivative by each variable, at their values.
+# Error and its derivative with respect to each variable, at given values.
 Residual: TypeAlias = Callable[..., tuple[FloatArray, Sequence[FloatArray]]]
 
 
 def vector_factor(
     keys: Sequence[int], noise: NoiseModel, residual: Residual, start: Sequence[FloatArray]
 ) -> Factor:
-    """Return a factor with an error function in Python, tried once at `start`.
+    """Return a factor with a Python error function, which is tried once at `start`.
 
     Raises
     ------
     InvalidArgumentError
-        If error or Jacobians do not have the shapes that noise model and variables ask for.
+        If error or Jacobians do not have the shapes that the noise model and the variables require.
 
     Examples
     --------
@@ -54,8 +54,8 @@ def vector_factor(
     _check(residual(*start), rows, shapes)
 
     def error(this: object, values: Any, jacobians: Any) -> FloatArray:
-        # A Jacobian of another row count than the noise model's is written past its end by gtsam: checked
-        # every time, since a shape may depend on the values.
+        # gtsam writes a Jacobian with a wrong number of rows past its end. The shape may depend on the
+        # values, so it is checked every time.
         found = residual(*map(values.atVector, keys))
         _check(found, rows, shapes)
         if jacobians is not None:
@@ -79,11 +79,11 @@ def _check(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
-    """The state of an entity that an observation is of."""
+    """A state of an entity, with the time from the state to an observation."""
 
     key: int
     state: FloatArray  # shape (4,): The present estimate
-    offset_s: float = 0.0  # From the state to the observation, at constant velocity
+    offset_s: float = 0.0  # Time from the state to the observation
 
     def placed(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (x, y, vx, vy) at the time of the observation, and its derivative."""
@@ -96,7 +96,7 @@ class Node:
 
 @lru_cache(maxsize=256)
 def noise_of(std: float, huber_k: float) -> NoiseModel:
-    """Return a deviation with a Huber loss."""
+    """Return a noise model with a standard deviation and a Huber loss."""
     import gtsam
 
     return _robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([std])), huber_k)
@@ -110,26 +110,26 @@ def _robust(plain: NoiseModel, huber_k: float) -> NoiseModel:
 
 @lru_cache(maxsize=64)
 def motion_noise(settings: SmoothingSettings, step_s: float) -> NoiseModel:
-    """Return the noise of (x, y, vx, vy) after a step of white acceleration."""
+    """Return the noise of (x, y, vx, vy) for a step of white acceleration."""
     import gtsam
 
     _, unit = constant_velocity(max(step_s, 1e-3))
     plain = gtsam.noiseModel.Gaussian.Covariance(settings.acceleration_psd * unit)
     if settings.manoeuvre_k is None:
         return plain
-    # Redescending, as a mixture of keeping the pace and of manoeuvres is: hidden places are off by 1.54 m,
-    # and by 1.85 m with Huber's loss, which grows on linearly.
+    # A redescending loss fits a mixture of constant pace and manoeuvres: hidden positions are off by 1.54 m.
+    # With Huber's loss, which grows linearly, it is 1.85 m.
     loss = gtsam.noiseModel.mEstimator.Cauchy.Create(settings.manoeuvre_k)
     return gtsam.noiseModel.Robust.Create(loss, plain)
 
 
 def motion_factor(before: Node, after: Node, step_s: float, noise: NoiseModel) -> Factor:
-    r"""Return constant velocity with white acceleration, metric noise over polar states.
+    r"""Return the factor of constant velocity with white acceleration, as metric noise on polar states.
 
     .. math:: e = c(x_{k+1}) - F\, c(x_k), \quad e \sim N(0, q\,Q(dt))
     """
-    # In polar coordinates the noise is q / r^2 with a range that is guessed: hidden positions were off by
-    # 1.28 m in place of 1.10 m, and their normalised squared error was 7.3 in place of 3.7 (ideal 4).
+    # In polar coordinates the noise is q / r^2 with a guessed range: hidden positions were off by 1.28 m (now
+    # 1.10 m), and their normalised squared error was 7.3 (now 3.7, ideal 4).
     flow = _flow(step_s)
 
     def error(x: FloatArray, y: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
@@ -146,26 +146,26 @@ def _flow(step_s: float) -> FloatArray:
 
 
 def bearing_factor(node: Node, one: Bearing, settings: SmoothingSettings) -> Factor:
-    """Return a measured azimuth."""
-    # Of the turns that mean the same, that nearest to the estimate.
+    """Return the factor of a measured azimuth."""
+    # Of the equivalent angles, the one nearest to the estimate.
     near = node.state[0] + wrap_angle(one.azimuth_rad - float(node.state[0]))
     return _scalar(node, (0, near), azimuth, one.azimuth_rad, one.std_rad, settings, angle=True)
 
 
 def approach_factor(node: Node, one: Approach, settings: SmoothingSettings) -> Factor:
-    """Return a measured approach rate."""
+    """Return the factor of a measured approach rate."""
     return _scalar(node, (2, -one.inverse_tta_hz), closing_rate, one.inverse_tta_hz, one.std_hz, settings)
 
 
 def range_factor(node: Node, one: Range, settings: SmoothingSettings) -> Factor:
-    """Return a measured distance, as its logarithm, which is a component of the state."""
-    # As exp(log r) a sharp range on a wide prior threw the visible phase off by 1.7 m in place of .35 m.
+    """Return the factor of a measured distance, as its logarithm, which is a component of the state."""
+    # With exp(log r), a precise range on a wide prior moved the visible phase by 1.7 m (now 0.35 m).
     value = math.log(one.range_m)
     return _scalar(node, (3, value), log_range, value, one.std_m / one.range_m, settings)
 
 
 def position_factor(node: Node, one: Position) -> Factor:
-    """Return a position, and a velocity over ground where that was measured."""
+    """Return the factor of a position, and of a velocity over ground if it was measured."""
     import gtsam
 
     covariance = np.array(one.covariance)
@@ -180,7 +180,7 @@ def position_factor(node: Node, one: Position) -> Factor:
 
 
 def height_factor(node: Node, height_key: int, one: AngularHeight, settings: SmoothingSettings) -> Factor:
-    r"""Return the height of a box: :math:`\log\alpha = \log h - \log r` with the entity's own height h."""
+    r"""Return the factor of a box height, :math:`\log\alpha = \log h - \log r` with the entity's height h."""
     start, value = np.array([math.log(one.true_height_m)]), math.log(one.height_rad)
 
     def error(state: FloatArray, log_m: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
@@ -202,11 +202,11 @@ def _scalar(
     *,
     angle: bool = False,
 ) -> Factor:
-    """Return a measurement of one number of an entity's place, at its own time a component of the state."""
+    """Return the factor of one measured number; without an offset it is a component of the state."""
     if node.offset_s == 0.0:
         import gtsam
 
-        # A prior of gtsam's own costs a tenth of a Python factor.
+        # A gtsam prior takes a tenth of the time of a Python factor.
         measured, precision = np.zeros(4), np.zeros(4)
         measured[component[0]], precision[component[0]] = component[1], 1.0 / std**2
         noise = _robust(gtsam.noiseModel.Diagonal.Precisions(precision), settings.robust_k)
@@ -222,7 +222,7 @@ def _scalar(
 
 
 def prior_factor(key: int, mean: FloatArray, covariance: FloatArray) -> Factor:
-    """Return a Gaussian prior of a variable."""
+    """Return a Gaussian prior factor of a variable."""
     import gtsam
 
     return gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Gaussian.Covariance(covariance))

@@ -1,12 +1,12 @@
-r"""The smoother: entities about a standing ego in one factor graph that reaches a fixed lag back.
+r"""Smoother for entities around an ego vehicle at rest: one factor graph over a fixed lag.
 
-Without gtsam filterpy's Rauch-Tung-Striebel smoother takes its place for a pass. A vehicle then keeps its
+Without gtsam, filterpy's Rauch-Tung-Striebel smoother replaces it for a single pass. A vehicle then keeps its
 velocity under white acceleration of density q, and every box is a position with
 
 .. math:: r = h / \alpha, \qquad R = U \operatorname{diag}(r^2 \sigma_\alpha^2,\; r^2 \sigma_\theta^2)\, U^T
 
-with the angular height alpha of a body of height h, its relative deviation, and U the axes along and across
-the bearing. No loss is robust, and no height is shared by the boxes of a pass.
+with the angular height alpha of a body of height h, its relative deviation, and the axes U along and across
+the bearing. The loss is not robust, and the boxes of a pass do not share a height.
 """
 
 import math
@@ -32,15 +32,16 @@ def _parameters() -> Any:
     import gtsam
 
     parameters = gtsam.ISAM2Params()
-    # Otherwise every factor that was ever marginalised keeps its slot: 4432 after 1500 steps, not 44.
+    # Without this, every factor that was ever marginalised keeps its slot: 4432 slots after 1500 steps, not
+    # 44.
     parameters.findUnusedFactorSlots = True
-    # Squared by Cholesky, a range that is not measured is indeterminate.
+    # Cholesky squares the matrix, which makes an unmeasured range indeterminate.
     parameters.setFactorization("QR")
     return parameters
 
 
 class FactorGraph:
-    """gtsam's incremental fixed-lag smoother, with the factors and values that wait for its next update."""
+    """gtsam's incremental fixed-lag smoother, with the factors and values for its next update."""
 
     def __init__(self, settings: obs.SmoothingSettings) -> None:
         import gtsam
@@ -54,15 +55,15 @@ class FactorGraph:
 
     def _clear(self) -> None:
         self.factors: list[Factor] = []
-        self.times: dict[int, float] = {}  # Until a lag after which variables are kept
+        self.times: dict[int, float] = {}  # Variables are kept until one lag after these times
         self._values: dict[int, FloatArray] = {}
 
     def add_variable(self, key: int, value: FloatArray, time_s: float) -> None:
-        """Add a variable at the next update."""
+        """Add a variable with the next update."""
         self._values[key], self.times[key] = value, time_s
 
     def update(self) -> None:
-        """Take in what has been added."""
+        """Apply the added factors and variables."""
         import gtsam
 
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -72,13 +73,13 @@ class FactorGraph:
             values.insert(key, value)
         self._updates += 1
         self._smoother.update(graph, values, self.times)
-        # One estimate costs as much as all, a quarter of an update: in between, what variables began with is
-        # near enough to begin the next ones with.
+        # One estimate takes as long as all of them: a quarter of an update. Until the next relinearisation,
+        # the initial values of variables are a good enough start for the next ones.
         self._near = {} if self._updates % self._every == 0 else self._near | self._values
         self._clear()
 
     def value(self, key: int) -> FloatArray:
-        """Return an estimate of a variable, no older than the last relinearisation."""
+        """Return an estimate of a variable that is no older than the last relinearisation."""
         if key in self._values:
             return self._values[key]
         if key not in self._near:
@@ -87,11 +88,11 @@ class FactorGraph:
 
     @property
     def n_factor_slots(self) -> int:
-        """How many factors the graph has room for, used or not."""
+        """Number of factor slots in the graph, used or not."""
         return int(self._smoother.getFactors().size())
 
     def refined(self, keys: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of variables, all that lies within the lag relinearised to the end."""
+        """Return mean and covariance of variables, after a full relinearisation of the lag."""
         import gtsam
 
         graph, slots = gtsam.NonlinearFactorGraph(), self._smoother.getFactors()
@@ -105,40 +106,40 @@ class FactorGraph:
         parameters.setMaxIterations(30)
         start = self._smoother.getLinearizationPoint()
         values = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
-        # gtsam's `Marginals` know Cholesky only from Python, which finds them indeterminate.
+        # From Python, gtsam's `Marginals` only use Cholesky, which finds these variables indeterminate.
         solved = gtsam.ISAM2(_parameters())
         solved.update(graph, values)
         return np.array([*map(values.atVector, keys)]), np.array([*map(solved.marginalCovariance, keys)])
 
 
-# Of (theta, theta_dot, rho) of an entity of which nothing is known: anywhere, passing or closing at
-# up to the rates of a vehicle some ten metres away.
+# Deviations of (theta, theta_dot, rho) for an unknown entity: any azimuth, and rates up to those of a vehicle
+# some ten metres away.
 _START_STD = (1.5, 0.7, 0.7, 0.7)
-# Distance at which an entity is first observed; the last deviation is of its logarithm.
+# Distance of an entity at its first observation; the last deviation above is that of its logarithm.
 _START_M = 25.0
 _BLOCK_NS = 1_000_000_000
 
 
 @dataclass(slots=True)
 class _Entity:
-    """The states of an entity within the lag."""
+    """States of an entity within the lag."""
 
-    # By stamp, in order: a late one has no state of its own.
+    # By stamp, in order; a late observation gets no state of its own.
     keys: dict[int, int] = field(default_factory=dict)
-    height_key: int | None = None  # Once its height is a variable
+    height_key: int | None = None  # Set when its height becomes a variable
 
     @property
     def last_ns(self) -> int:
-        """Stamp of its last state."""
+        """Stamp of the last state."""
         return next(reversed(self.keys))
 
 
 class FixedLagSmoother:
-    r"""Corrects where entities were once it is known where they came out.
+    r"""Corrects past positions of entities when later observations show their path.
 
-    Every update adds a state to each entity that it observes, and a factor to the graph for each observation;
-    gtsam's incremental smoother solves for all of the last `lag_s` seconds. The ego stands. Late observations
-    within the lag are taken in.
+    Every update adds one state per observed entity and one factor per observation; gtsam's incremental
+    smoother solves for the last `lag_s` seconds. The ego vehicle is at rest. Late observations within the lag
+    are used.
 
     Parameters
     ----------
@@ -148,7 +149,7 @@ class FixedLagSmoother:
     Attributes
     ----------
     n_dropped : int
-        Observations that came later than the lag reaches.
+        Number of observations that came too late for the lag.
 
     Examples
     --------
@@ -180,25 +181,25 @@ class FixedLagSmoother:
 
     @property
     def n_factor_slots(self) -> int:
-        """How many factors the graph has room for, used or not."""
+        """Number of factor slots in the graph, used or not."""
         return self._graph.n_factor_slots
 
     def begin(self, entity: str, stamp_ns: int, belief: MotionBelief) -> None:
-        """Add an entity with what is known of it; without, it begins where it is first observed.
+        """Add an entity with a prior belief; without one, an entity begins at its first observation.
 
         Parameters
         ----------
         entity : str
             Name of an entity that has no state yet.
         stamp_ns : int
-            Time of the belief, ns; the update at this stamp or a later one takes it in.
+            Time of the belief, ns; it takes effect with the update at this stamp or a later one.
         belief : MotionBelief
-            Of the filter, say.
+            For example, the belief of the filter.
 
         Raises
         ------
         InvalidArgumentError
-            If it has a state.
+            If the entity has a state already.
         """
         if entity in self._entities:
             raise InvalidArgumentError(f"entity: expected a new one, got {entity!r:.40}")
@@ -208,14 +209,14 @@ class FixedLagSmoother:
         self._graph.factors.append(f.prior_factor(key, belief.mean, belief.covariance))
 
     def update(self, stamp_ns: int, observations: Mapping[str, Sequence[obs.Observation]]) -> None:
-        """Take in what was observed at one instant, of any number of entities.
+        """Apply the observations of one instant, of any number of entities.
 
         Parameters
         ----------
         stamp_ns : int
-            When it was observed, ns; earlier than the last one where it comes late.
+            Time of the observations, ns; late observations have a stamp before the last one.
         observations : mapping of str to sequence
-            By entity. A new one begins at a bearing or a position.
+            Observations by entity. A new entity needs a bearing or a position.
 
         Raises
         ------
@@ -244,12 +245,12 @@ class FixedLagSmoother:
         Returns
         -------
         SmoothedTrack
-            With covariance at every state.
+            All states with their covariance.
 
         Raises
         ------
         InvalidArgumentError
-            If there is none of this name.
+            If there is no entity with this name.
         """
         one = self._entities.get(entity)
         if one is None:
@@ -263,8 +264,8 @@ class FixedLagSmoother:
             self._origin_ns = self._now_ns = stamp_ns
 
     def _time_s(self, stamp_ns: int) -> float:
-        # In whole seconds: the states of one second are marginalised together. One after the other every step
-        # would eliminate the whole lag anew.
+        # In whole seconds, so that the states of one second are marginalised together. One by one, every step
+        # would eliminate the whole lag again.
         return float((stamp_ns - (self._origin_ns or 0)) // _BLOCK_NS)
 
     @property
@@ -272,7 +273,7 @@ class FixedLagSmoother:
         return self._time_s(self._now_ns) - self.settings.lag_s
 
     def _add_state(self, one: _Entity, stamp_ns: int, state: FloatArray) -> int:
-        # Of an entity and a stamp: keys may not come again within the lag, and stamps are too long for one.
+        # A number, because keys must be unique within the lag, and stamps are too long for a key.
         key = next(self._numbers)
         one.keys[stamp_ns] = key
         self._graph.add_variable(key, state, self._time_s(stamp_ns))
@@ -289,7 +290,7 @@ class FixedLagSmoother:
             self._graph.factors.append(self._factor(one, node, said))
 
     def _first(self, entity: str, stamp_ns: int, every: Sequence[obs.Observation]) -> _Entity:
-        """Begin an entity where it is first observed, with a prior that is wide in all else."""
+        """Begin an entity at its first observation, with a wide prior for everything else."""
         toward = next((one.azimuth_rad for one in every if isinstance(one, Bearing)), None)
         log_m = math.log(next((one.range_m for one in every if isinstance(one, obs.Range)), _START_M))
         place = next((one.position_m for one in every if isinstance(one, Position)), None)
@@ -306,7 +307,7 @@ class FixedLagSmoother:
         return one
 
     def _go_on(self, one: _Entity, stamp_ns: int) -> None:
-        """Add the next state of an entity, reached at constant velocity."""
+        """Add the next state of an entity, predicted at constant velocity."""
         last_ns = one.last_ns
         key, step_s = one.keys[last_ns], seconds(stamp_ns - last_ns)
         before = f.Node(key, self._graph.value(key))
@@ -317,8 +318,8 @@ class FixedLagSmoother:
 
     def _node(self, one: _Entity, stamp_ns: int) -> f.Node:
         """Return the state nearest to a stamp."""
-        # A state in between would need the motion between its neighbours taken out of the graph. Over half a
-        # hop white acceleration moves no vehicle by more than a centimetre.
+        # A new state between two others would require the removal of their motion factor. Over half a hop
+        # white acceleration moves a vehicle by at most a centimetre.
         nearest = min(one.keys, key=lambda ns: (abs(ns - stamp_ns), -ns))
         key = one.keys[nearest]
         return f.Node(key, self._graph.value(key), seconds(stamp_ns - nearest))
@@ -337,7 +338,7 @@ class FixedLagSmoother:
                 return f.height_factor(node, self._height(one, said), said, self.settings)
 
     def _height(self, one: _Entity, said: obs.AngularHeight) -> int:
-        """Return the key of an entity's height, which lives as long as its states."""
+        """Return the key of an entity's height, a variable that is kept as long as the entity's states."""
         if one.height_key is None:
             one.height_key, start = next(self._numbers), np.array([math.log(said.true_height_m)])
             self._graph.add_variable(one.height_key, start, self._time_s(self._now_ns))
@@ -346,13 +347,12 @@ class FixedLagSmoother:
         return one.height_key
 
     def _keep_heights(self) -> None:
-        # A height that outlives the states of its entity is refused by gtsam when its turn comes.
+        # gtsam raises an error if it marginalises a height after the states of its entity.
         for one in self._entities.values():
             if one.height_key is not None:
-                self._graph.times[one.height_key] = self._time_s(one.last_ns)  # For another lag
+                self._graph.times[one.height_key] = self._time_s(one.last_ns)  # Kept for another lag
 
     def _forget(self) -> None:
-        """Forget states that gtsam has marginalised."""
         oldest_s = self._oldest_s
         for name, one in list(self._entities.items()):
             one.keys = {ns: key for ns, key in one.keys.items() if self._time_s(ns) >= oldest_s}
@@ -360,14 +360,14 @@ class FixedLagSmoother:
                 del self._entities[name]
 
 
-# m^2/s^3; hidden places of 259 simulated passes are off by 1.87 m with it, and by 1.34 m with robust losses.
+# m^2/s^3. Hidden positions of 259 simulated passes are off by 1.87 m; with robust losses it is 1.34 m.
 _ACCELERATION_PSD = 1.0
 
 
 def rts_track(
     entity: str, start: MotionBelief, observed: Mapping[int, Sequence[obs.Observation]]
 ) -> obs.SmoothedTrack:
-    """Return the smoothed track of a vehicle that a standing ego observes, by stamps in ns.
+    """Return the smoothed track of a vehicle near an ego vehicle at rest; `observed` is by stamp in ns.
 
     Raises
     ------
@@ -399,7 +399,7 @@ def rts_track(
 
 
 def _placed(every: Sequence[obs.Observation]) -> tuple[FloatArray, FloatArray] | None:
-    """Return position and covariance by the bearing and the height of a box, None without them."""
+    """Return position and covariance from the bearing and the height of a box; None without them."""
     toward = next((one for one in every if isinstance(one, Bearing)), None)
     height = next((one for one in every if isinstance(one, obs.AngularHeight)), None)
     if toward is None or height is None:

@@ -1,6 +1,6 @@
-"""A street learned from the vehicles that passed: edges, pace, arrivals, sound of its arms.
+"""Model of a street, learned from vehicles that passed: edges, pace, arrivals and sound of its arms.
 
-Only sufficient statistics are kept: a pass is added, and time forgotten, without the passes before it.
+Only sufficient statistics are stored, so an update with a pass or with time needs no earlier passes.
 """
 
 import math
@@ -15,7 +15,7 @@ from worldstate.state.context import Context, Occluder, Rates, blind_corner, hid
 
 @dataclass(frozen=True, slots=True)
 class NormalPrior:
-    """What is believed of a quantity at a place where it was never observed.
+    """Prior of a quantity at a place without observations.
 
     Examples
     --------
@@ -24,19 +24,19 @@ class NormalPrior:
     """
 
     mean: float
-    mean_std: float  # Of the place's own mean
-    spread: float  # Of single observations about it
-    freedom: float = 2.0  # Observations that the spread counts as
+    mean_std: float  # Deviation of the mean of this place
+    spread: float  # Deviation of single observations from that mean
+    freedom: float = 2.0  # Number of observations that the prior of the spread is worth
 
     @property
     def passes(self) -> float:
-        """How many observations the mean counts as."""
+        """Number of observations that the mean is worth."""
         return round((self.spread / self.mean_std) ** 2, 12)
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Sufficient statistics of a normal quantity; sums fade, so weights are no whole numbers.
+    """Sufficient statistics of a normal quantity; sums fade, so weights are not whole numbers.
 
     Examples
     --------
@@ -53,12 +53,12 @@ class Moments:
         in_range("weight", self.weight, 0.0, 1e12)
 
     def plus(self, value: float, weight: float = 1.0) -> "Moments":
-        """Return them with one observation more."""
+        """Return the statistics after one more observation."""
         total, squares = self.total + weight * value, self.squares + weight * value * value
         return Moments(self.weight + weight, total, squares)
 
     def faded(self, factor: float) -> "Moments":
-        """Return them with everything weighed less."""
+        """Return the statistics with a lower weight."""
         return Moments(factor * self.weight, factor * self.total, factor * self.squares)
 
     def posterior(self, prior: NormalPrior) -> tuple[float, float, float]:
@@ -69,14 +69,14 @@ class Moments:
         """
         counted = prior.passes + self.weight
         mean = (prior.passes * prior.mean + self.total) / counted
-        # Of a single observation it is zero, but for rounding.
+        # Zero for a single observation, except for rounding.
         within = max(self.squares - self.total**2 / self.weight, 0.0) if self.weight > 0.0 else 0.0
         spread = math.sqrt((prior.freedom * prior.spread**2 + within) / (prior.freedom + self.weight))
         return mean, spread / math.sqrt(counted), spread
 
     def log_predictive(self, value: float, prior: NormalPrior) -> float:
         """Return the log density of the next observation, a Student t, nats."""
-        # scipy.stats takes a third of a second to import, and a context is read without it.
+        # Imported here: scipy.stats takes a third of a second, and reading a context does not need it.
         from scipy.stats import t as student_t
 
         mean, mean_std, spread = self.posterior(prior)
@@ -84,33 +84,33 @@ class Moments:
         return float(student_t.logpdf(value, freedom, mean, scale))
 
 
-# Of passes on simulated streams one in twenty begins elsewhere: a bicycle whose first boxes were missed, two
-# vehicles taken for one.
+# On simulated streams one pass in twenty begins elsewhere: a bicycle whose first boxes were missed, or two
+# vehicles tracked as one.
 _STRAY = 0.05
-# A single pass adds -log(.05) = 3 nats at most, so that at least two in a row have to be strange.
+# A single pass adds at most -log(0.05) = 3 nats, so it takes at least two strange passes in a row.
 _THRESHOLD = 5.0
-# First boxes at one simulated corner lie within .2 degrees of one another; real ones, of bodies of other
-# heights and with other misses, farther apart, which the passes tell.
+# First boxes at one simulated corner are within 0.2 degrees of one another. With real bodies of different
+# heights, and other misses, they are farther apart; the passes themselves determine how far.
 _SPREAD_RAD = math.radians(0.5)
-_KNOWN = 1.5  # Passes that make an edge known
+_KNOWN = 1.5  # Number of passes that make an edge known
 _USUAL = blind_corner("left", 1)
-# An edge that a camera of 69 degrees sees stands between 5 and 35 degrees from the axis.
+# An edge in the view of a 69-degree camera is between 5 and 35 degrees from the axis.
 _UNIFORM = -math.log(math.radians(30.0))
 EDGE_PRIOR = NormalPrior(_USUAL.edge_azimuth_rad, _USUAL.edge_std_rad, _SPREAD_RAD, freedom=8.0)
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedEdge:
-    r"""Azimuth of an edge, radians away from the axis, and how much the last passes contradict it.
+    r"""Azimuth of an edge, radians from the axis, and how strongly the last passes contradict it.
 
-    With :math:`p(x)` the predictive density of the next pass's edge and :math:`u` a uniform one over the
-    edges that a camera sees, a pass belongs to the edge with the probability r and adds to the surprise S,
+    With the predictive density :math:`p(x)` of the next pass's edge and a uniform density :math:`u` over the
+    edges in a camera's view, a pass belongs to the edge with the probability r and adds to the surprise S,
 
     .. math:: r = \frac{(1 - \epsilon)\, p}{(1 - \epsilon)\, p + \epsilon u}, \qquad
         S \leftarrow \max\left(0,\; S + \log \frac{u}{(1 - \epsilon)\, p + \epsilon u}\right)
 
-    (Page, "Continuous inspection schemes", 1954). Beyond a threshold the edge is what the passes since S was
-    zero say.
+    (Page, "Continuous inspection schemes", 1954). Beyond a threshold the edge is estimated again from the
+    passes since S was zero.
 
     Examples
     --------
@@ -128,49 +128,50 @@ class LearnedEdge:
 
     @property
     def mean_rad(self) -> float:
-        """Where it stands."""
+        """Mean azimuth of the edge."""
         return self.moments.posterior(EDGE_PRIOR)[0]
 
     @property
     def std_rad(self) -> float:
-        """Standard deviation of where the next vehicle comes into view."""
+        """Standard deviation of the azimuth at which the next vehicle comes into view."""
         _, mean_std, spread = self.moments.posterior(EDGE_PRIOR)
         return math.hypot(mean_std, spread)
 
     def with_pass(self, azimuth_rad: float) -> "LearnedEdge":
-        """Return it after one more vehicle came into view, at an azimuth away from the axis."""
+        """Return the edge after one more vehicle came into view at an azimuth from the axis."""
         expected = math.log1p(-_STRAY) + self.moments.log_predictive(azimuth_rad, EDGE_PRIOR)
         either = math.log(math.exp(expected) + _STRAY * math.exp(_UNIFORM))
-        # A first pass far from the usual corner contradicts nothing that was seen here.
+        # A first pass far from the usual corner contradicts no earlier pass.
         met = self.moments.weight > 0.0
         surprise = max(0.0, self.surprise + _UNIFORM - either) if met else 0.0
         since = self.since.plus(azimuth_rad) if surprise > 0.0 else Moments()
         if surprise > _THRESHOLD:
-            # Against a single pass two others are no change of the place: that one was the stray.
+            # If two passes contradict a single earlier one, the earlier one was the stray: the place has not
+            # changed.
             return LearnedEdge(since, changes=self.changes + (self.moments.weight >= _KNOWN))
         moments = self.moments.plus(azimuth_rad, math.exp(expected - either))
         return LearnedEdge(moments, surprise, since, self.changes)
 
     def faded(self, factor: float) -> "LearnedEdge":
-        """Return it with everything weighed less; surprise is not a matter of age."""
+        """Return the edge with a lower weight of its passes; the surprise does not depend on age."""
         return replace(self, moments=self.moments.faded(factor))
 
 
 Arm = Literal["left", "right"]
 ARMS: tuple[Arm, Arm] = ("left", "right")
-# A building stands for years, traffic changes with the season: after a month a pass counts a third.
+# A building stays for years, traffic changes with the season: after a month a pass has a third of its weight.
 DAY_S = 86400.0
 FORGETTING_S = 30.0 * DAY_S
-# Of the logarithm: drivers at a usual corner have .5 per second; simulated junctions have .4 to .7 in the
-# median, and their drivers differ by a factor of 1.35.
+# Logarithm of the pace. Drivers at a usual corner have 0.5 per second. Simulated junctions have medians of
+# 0.4 to 0.7, and their drivers differ by a factor of 1.35.
 PACE_PRIOR = NormalPrior(math.log(0.5), 0.22, 0.3)
-# An arm of which no edge was seen keeps the corner of a usual junction.
+# An arm without an observed edge keeps the corner of a usual junction.
 _LEAST_WEIGHT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class StreetPass:
-    """One vehicle that came into view out of an arm.
+    """One vehicle that came into view from an arm.
 
     Examples
     --------
@@ -179,14 +180,14 @@ class StreetPass:
     """
 
     arm: Arm
-    edge_rad: float | None  # Azimuth of the edge that it came out of; None where the image ends before it
-    pace_hz: float | None  # How fast the tangent of its azimuth fell there
-    sound: PassSound | None = None  # Before it came into view
+    edge_rad: float | None  # Azimuth of the edge that it passed; None if the image ends before it
+    pace_hz: float | None  # Rate at which the tangent of its azimuth fell there
+    sound: PassSound | None = None  # Sound before it came into view
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedArm:
-    """One arm: its edge, the pace of its drivers, and how many vehicles came in which time."""
+    """One arm: its edge, the pace of its drivers, and its arrivals in the observed time."""
 
     direction: Arm
     edge: LearnedEdge = field(default_factory=LearnedEdge)
@@ -196,8 +197,8 @@ class LearnedArm:
 
     @property
     def rate_hz(self) -> float:
-        """Expected arrivals a second: a Gamma prior about the usual rate, which counts as one arrival."""
-        # A minute of watching outweighs it: streets differ by a factor of three either way.
+        """Expected arrivals per second; a Gamma prior around the usual rate is worth one arrival."""
+        # One minute of observation outweighs this prior: streets differ by a factor of three either way.
         usual_hz = Rates().arrival_hz
         return usual_hz * (1.0 + self.arrivals) / (1.0 + usual_hz * self.exposure_s)
 
@@ -213,7 +214,7 @@ class LearnedArm:
         return math.hypot(mean_std, spread)
 
     def with_pass(self, one: StreetPass) -> "LearnedArm":
-        """Return it after one more vehicle came out of it."""
+        """Return the arm after one more vehicle came from it."""
         edge, log_pace = self.edge, self.log_pace
         if one.edge_rad is not None:
             edge = edge.with_pass(abs(one.edge_rad))
@@ -222,14 +223,14 @@ class LearnedArm:
         return LearnedArm(self.direction, edge, log_pace, self.arrivals + 1.0, self.exposure_s)
 
     def faded(self, factor: float) -> "LearnedArm":
-        """Return it with everything weighed less."""
+        """Return the arm with a lower weight of its passes."""
         edge, log_pace = self.edge.faded(factor), self.log_pace.faded(factor)
         return LearnedArm(self.direction, edge, log_pace, factor * self.arrivals, factor * self.exposure_s)
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedStreet:
-    """What is known of one place from the vehicles that passed it.
+    """Model of one place from the vehicles that passed it.
 
     Examples
     --------
@@ -245,7 +246,7 @@ class LearnedStreet:
 
     site: str | None = None
     arms: tuple[LearnedArm, LearnedArm] = (LearnedArm("left"), LearnedArm("right"))
-    # What either arm sounds like
+    # Sound patterns of both arms
     patterns: SidePatterns = field(default_factory=SidePatterns, metadata=ADDED)
 
     def __post_init__(self) -> None:
@@ -262,24 +263,24 @@ def with_pass(street: LearnedStreet, one: StreetPass) -> LearnedStreet:
 
 
 def watched(street: LearnedStreet, time_s: float) -> LearnedStreet:
-    """Return the street after it was watched for a time."""
+    """Return the street after it was observed for a time."""
     in_range("time_s", time_s, 0.0, 1e9)
     left, right = (replace(arm, exposure_s=arm.exposure_s + time_s) for arm in street.arms)
     return replace(street, arms=(left, right))
 
 
 def forgotten(street: LearnedStreet, time_s: float) -> LearnedStreet:
-    """Return the street some time later: everything counts less, and means stay where they are."""
+    """Return the street some time later: weights decrease, and means stay the same."""
     factor = math.exp(-in_range("time_s", time_s, 0.0, 1e12) / FORGETTING_S)
     left, right = (arm.faded(factor) for arm in street.arms)
     return replace(street, arms=(left, right), patterns=street.patterns.faded(factor))
 
 
 def context_of(street: LearnedStreet) -> Context:
-    """Return a street as the context of a filter: its edges and paces; the rest is as in `Context()`.
+    """Return a street as the context of a filter, with its edges and paces; the rest is as in `Context()`.
 
-    Arrivals are left to the filter, which learns the traffic of the hour: given as priors, they move its
-    alarm away from the onsets an hour that it was set for.
+    Arrivals are left out, because the filter learns the present traffic itself. As priors they would move the
+    alarm away from the onsets per hour for which it was set.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-r"""What the smoother takes, settings and observations, and what it gives: a track and its first sight.
+r"""Input and output of the smoother: settings, observations, tracks and times of first sight.
 
-An entity is :math:`(\theta, \dot\theta, \rho, \log r)` about an ego that stands; in Cartesian coordinates,
-with d the unit vector at :math:`\theta` and n that to its left,
+An entity is :math:`(\theta, \dot\theta, \rho, \log r)` relative to an ego vehicle at rest. In Cartesian
+coordinates, with the unit vectors d at :math:`\theta` and n to its left,
 
 .. math:: p = r\, d, \qquad v = r\,(\rho\, d + \dot\theta\, n).
 """
@@ -16,9 +16,9 @@ from worldstate.belief.kinematics.motion import AZIMUTH, LEAST_STD, MotionBelief
 from worldstate.ground import FloatArray, IntArray, in_range, seconds, wrap_angle
 from worldstate.measurement import Approach, Bearing, Position
 
-# No entity comes nearer to the ego than this; at 0 bearings have no derivative.
+# No entity comes closer to the ego vehicle than this; at 0 bearings have no derivative.
 _NEAREST_SQUARE_M2 = 0.25
-# exp overflows where approach rates that contradict each other drive log r, which is not measured.
+# exp overflows if contradictory approach rates drive log r, which is not measured.
 _FARTHEST_LOG_M = math.log(1e4)
 
 
@@ -33,7 +33,7 @@ def cartesian(state: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def moved(state: FloatArray, step_s: float) -> FloatArray:
-    """Return a polar state after so many seconds of constant velocity, its azimuth not wrapped.
+    """Return a polar state after some seconds of constant velocity; the azimuth is not wrapped.
 
     Examples
     --------
@@ -41,7 +41,7 @@ def moved(state: FloatArray, step_s: float) -> FloatArray:
     [6.0, 0.0, -0.111, 1.895]
     """
     theta, turning, closing, log_m = state.tolist()
-    # The filter's `propagate` takes the same steps for arrays, and forty times as long for one entity.
+    # The filter's `propagate` computes the same for arrays, but takes forty times as long for one entity.
     a, b = 1.0 + closing * step_s, turning * step_s
     q = max(a * a + b * b, LEAST_STD)
     radial = (a * closing + b * turning) / q
@@ -49,7 +49,7 @@ def moved(state: FloatArray, step_s: float) -> FloatArray:
 
 
 def azimuth(place: FloatArray) -> tuple[float, FloatArray]:
-    """Return the azimuth of a place, and its derivative by (x, y, vx, vy)."""
+    """Return the azimuth of a place, and its derivative with respect to (x, y, vx, vy)."""
     x, y = place[:2].tolist()
     square = max(x * x + y * y, _NEAREST_SQUARE_M2)
     return math.atan2(y, x), np.array([[-y / square, x / square, 0.0, 0.0]])
@@ -92,16 +92,16 @@ class Range:
 
 @dataclass(frozen=True, slots=True)
 class AngularHeight:
-    """The height of a box around an entity, as an angle: it tells the distance as well as the true height.
+    """Angular height of a box around an entity, which gives the distance if the true height is known.
 
     Parameters
     ----------
     height_rad : float
         Radians, > 0.
     relative_std : float
-        Its standard deviation over itself, > 0.
+        Relative standard deviation, > 0.
     true_height_m, true_relative_std : float
-        How high such an entity is, and how widely that varies; said once, with the first of its boxes.
+        True height of such an entity and its relative deviation; only those of its first box are used.
 
     Examples
     --------
@@ -112,7 +112,7 @@ class AngularHeight:
     height_rad: float
     relative_std: float
     true_height_m: float = 1.5
-    # From a small car to a sports utility vehicle.
+    # Range from a small car to a sports utility vehicle.
     true_relative_std: float = 0.1
 
 
@@ -121,23 +121,23 @@ Observation: TypeAlias = Bearing | Approach | Position | Range | AngularHeight
 
 @dataclass(frozen=True, slots=True)
 class SmoothingSettings:
-    r"""How far back the smoother corrects, and how vehicles are taken to drive.
+    r"""Lag of the smoother, and motion model of vehicles.
 
     Parameters
     ----------
     lag_s : float
-        How long states stay in the graph, s: longer than a vehicle is heard before it is seen.
+        Time that states stay in the graph, s; longer than the time from a vehicle's first sound to its sight.
     acceleration_psd : float
         Density of the white acceleration, m^2/s^3.
     robust_k : float
-        Residual in standard deviations from which on the Huber loss of bearings, approach rates and boxes
+        Residual, in standard deviations, above which the Huber loss of bearings, approach rates and boxes
         grows linearly.
     manoeuvre_k : float or None
-        Scale of the Cauchy loss of the motion between two states, whose whitened norm is 2 in the mean.
-        A driver then keeps the pace most of the time, and now and then brakes, accelerates or turns off,
-        at a lower cost than as white acceleration. None for a Gaussian.
+        Scale of the Cauchy loss of the motion between two states, whose whitened norm is 2 on average. A
+        driver then keeps the pace most of the time and sometimes brakes, accelerates or turns off, at a lower
+        cost than under white acceleration. None for a Gaussian loss.
     relinearize_every : int
-        Updates between two relinearisations.
+        Number of updates between two relinearisations.
 
     Raises
     ------
@@ -152,10 +152,10 @@ class SmoothingSettings:
 
     lag_s: float = 15.0
     acceleration_psd: float = 1.0
-    # 95 % as efficient as least squares where all residuals are Gaussian (Huber, 1981).
+    # 95 % of the efficiency of least squares if all residuals are Gaussian (Huber, 1981).
     robust_k: float = 1.345
     manoeuvre_k: float | None = None
-    # Relinearising at every update costs four times as much and moves the result by less than a percent.
+    # Relinearisation at every update takes four times as long and changes the result by less than 1 %.
     relinearize_every: int = 10
 
     def __post_init__(self) -> None:
@@ -169,7 +169,7 @@ class SmoothingSettings:
 
 @dataclass(frozen=True, slots=True)
 class FirstSight:
-    """When an entity came into line of sight past an edge, T0.
+    """Time T0 at which an entity came into line of sight past an edge.
 
     Parameters
     ----------
@@ -195,11 +195,11 @@ class SmoothedTrack:
     entity : str
         Its name.
     stamps_ns : ndarray, shape (n,)
-        Of its states, in order.
+        Stamps of its states, in order.
     motion : MotionBelief
-        Polar states about the ego, mean (n, 4) and covariance (n, 4, 4).
+        Polar states relative to the ego vehicle, mean (n, 4) and covariance (n, 4, 4).
     smoother : {"fixed-lag smoother", "RTS smoother"}
-        By which it was made: gtsam's factor graph, or filterpy's where gtsam is not installed.
+        Method: gtsam's factor graph, or filterpy's smoother if gtsam is not installed.
 
     Examples
     --------
@@ -236,9 +236,9 @@ class SmoothedTrack:
         return np.asarray(np.sqrt(np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, -1]))
 
     def first_sight(self, side: int, edge_rad: float, edge_std_rad: float) -> FirstSight | None:
-        r"""Return when it last passed the azimuth of an edge, None where it did not within the lag.
+        r"""Return when it last passed the azimuth of an edge; None if this was not within the lag.
 
-        With u the azimuth beyond the edge, side 1 left and -1 right of it,
+        With the azimuth u beyond the edge, on side 1 (left) or -1 (right) of it,
 
         .. math:: u(T_0) = 0, \qquad \sigma = \sqrt{\sigma_\theta^2 + \sigma_{edge}^2}\, /\, |\dot u|.
 
@@ -252,7 +252,7 @@ class SmoothedTrack:
         (0.5, 0.1)
         """
         beyond = side * wrap_angle(self.motion.mean[:, AZIMUTH] - edge_rad)
-        # From behind the ego vehicle azimuths beyond the edge go on at the other end of the turn.
+        # Behind the ego vehicle, azimuths beyond the edge continue at the other end of the turn.
         ahead = beyond[:-1] - beyond[1:] < math.pi
         crossed = np.flatnonzero((beyond[:-1] > 0.0) & (beyond[1:] <= 0.0) & ahead)
         if not crossed.size:
