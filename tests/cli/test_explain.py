@@ -191,7 +191,7 @@ def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, t
     file.write_text(states.read_text().replace('"version":"4.2.0"', '"version":"2.1.0"'))
     assert main(["explain", str(file), "--time", "1"]) == 2
     assert "old.jsonl: expected schema worldstate.Snapshot 4.x, got" in (said := capsys.readouterr().err)
-    assert "write it anew" in said
+    assert "write it again" in said
     file.write_text("")
     assert main(["explain", str(file), "--time", "1"]) == 2
     assert "worldstate run --out" in capsys.readouterr().err

@@ -174,7 +174,7 @@ def test_json_text_can_be_written_again_or_is_refused(key, value):
         halves.decode("utf-16")
     except UnicodeDecodeError:
         for refused in (text, json.dumps({key: value}, ensure_ascii=False)):
-            with pytest.raises(InvalidArgumentError, match=r"^car: expected JSON, got a text that is none"):
+            with pytest.raises(InvalidArgumentError, match=r"^car: expected JSON, got text that is not JSON"):
                 decode_json(refused, "car")
     else:
         json.dumps(decode_json(text, "car"), ensure_ascii=False).encode()

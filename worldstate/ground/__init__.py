@@ -1,4 +1,4 @@
-"""What every room may import, and what imports none of them: errors, checks, values, schemas."""
+"""Errors, checks, values and schemas, which all other packages may import."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""Checks for the public boundary: called once there, trusted inside.
+"""Checks for the public boundary: values are checked once there and trusted inside.
 
-Every check names the argument, what came and what was expected.
+Every message contains the argument, its value and the expected value.
 """
 
 import math
@@ -16,12 +16,12 @@ from .errors import InvalidArgumentError
 from .typing import ComplexArray, FloatArray
 
 T = TypeVar("T")
-# Ends of a range that leaves out zero, one or infinity.
+# Limits of a range that excludes zero, one or infinity.
 ABOVE_ZERO, BELOW_ONE, MOST = math.ulp(0.0), math.nextafter(1.0, 0.0), sys.float_info.max
 
 
 def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> FloatArray:
-    """Return `value` as finite float64 of the given shape; `None` leaves an axis free.
+    """Return `value` as finite float64 of the given shape; `None` allows any length of an axis.
 
     Examples
     --------
@@ -29,7 +29,7 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Fl
     array([1., 2., 3.])
     """
     try:
-        # By `dtype` it would read numbers written as text.
+        # With `dtype`, numpy would also read numbers written as text.
         array = np.asarray(value).astype(np.float64, casting="same_kind", copy=False)
     except (TypeError, ValueError, OverflowError) as error:
         raise InvalidArgumentError(f"{name}: expected numbers, got {type(value).__name__}") from error
@@ -41,7 +41,7 @@ def finite_array(name: str, value: ArrayLike, shape: Sequence[int | None]) -> Fl
 
 
 def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> ComplexArray:
-    """Return `value` as finite complex numbers of the given shape, keeping single precision as it is.
+    """Return `value` as finite complex numbers of the given shape; single precision is kept.
 
     Examples
     --------
@@ -62,7 +62,7 @@ def finite_complex(name: str, value: ArrayLike, shape: Sequence[int | None]) -> 
 
 
 def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None]) -> None:
-    """Refuse a shape that does not fit; `None` in `expected` leaves an axis free.
+    """Raise an error for a wrong shape; `None` in `expected` allows any length of an axis.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def check_shape(name: str, got: tuple[int, ...], expected: Sequence[int | None])
 
 
 def freeze_arrays(instance: object, **shapes: Sequence[int | None]) -> None:
-    """Put read-only copies in place of the named arrays of a frozen dataclass, once they are checked."""
+    """Replace the given arrays of a frozen dataclass by checked, read-only copies."""
     for name, shape in shapes.items():
         value = finite_array(name, getattr(instance, name), shape).copy()
         value.flags.writeable = False
@@ -85,17 +85,17 @@ def freeze_arrays(instance: object, **shapes: Sequence[int | None]) -> None:
 def in_range(
     name: str, value: float, low: float, high: float, *, open_low: bool = False, open_high: bool = False
 ) -> float:
-    """Return `value` as a float if it lies in the range, ends included unless said otherwise.
+    """Return `value` as a float if it is in the range; ends are included unless they are open.
 
     Examples
     --------
     >>> in_range("alpha", 0.02, 0, 1, open_low=True)
     0.02
     """
-    if type(value) is float and low < value < high:  # Nearly all
+    if type(value) is float and low < value < high:  # The usual case
         return value
     try:
-        number = math.ldexp(value, 0)  # As `float`, which would read text
+        number = math.ldexp(value, 0)  # Like `float`, but it does not read text
     except (TypeError, OverflowError) as error:
         raise InvalidArgumentError(f"{name}: expected a number, got {type(value).__name__}") from error
     if not math.isfinite(number):
@@ -109,7 +109,7 @@ def in_range(
 
 
 def check_ranges(instance: object, **ranges: tuple[float, float]) -> None:
-    """Refuse fields of a dataclass outside their ranges, ends included; they stay as they were given.
+    """Raise an error for fields of a dataclass outside their ranges, ends included; no value is changed.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def check_ranges(instance: object, **ranges: tuple[float, float]) -> None:
 
 
 def pair(name: str, value: ArrayLike, largest: float) -> tuple[float, float]:
-    """Return two numbers, neither of which exceeds `largest` in size.
+    """Return two numbers with absolute values of at most `largest`.
 
     Examples
     --------
@@ -134,7 +134,7 @@ def pair(name: str, value: ArrayLike, largest: float) -> tuple[float, float]:
 
 
 def one_of(name: str, value: str, expected: Iterable[str]) -> str:
-    """Return `value` if it is one of the words expected.
+    """Return `value` if it is one of the expected words.
 
     Examples
     --------
@@ -147,7 +147,7 @@ def one_of(name: str, value: str, expected: Iterable[str]) -> str:
 
 
 def named(name: str, value: object) -> None:
-    """Refuse what is no name.
+    """Raise an error unless the value is a text that is not empty.
 
     Examples
     --------
@@ -158,9 +158,10 @@ def named(name: str, value: object) -> None:
 
 
 def check_fields(instance: object, **expected: Any) -> None:
-    """Refuse a field of a frozen dataclass that is not as expected: a type, or the ends of a number's range.
+    """Raise an error for a field that does not have the expected type, or is outside the expected range.
 
-    Numbers and what numpy has of them become Python's own; None is as expected if the range ends with it.
+    A tuple gives a range; one that ends with None also allows None. Numbers are converted to Python's own
+    types.
 
     Examples
     --------
@@ -172,7 +173,7 @@ def check_fields(instance: object, **expected: Any) -> None:
     """
     for name, wanted in expected.items():
         value, is_range = getattr(instance, name), type(wanted) is tuple
-        # Nearly all: NaN compares false, and numpy's float64 is a float of another type.
+        # The usual case. NaN compares false, and numpy's float64 is a float of another type.
         if is_range:
             if type(value) is float and wanted[0] <= value <= wanted[1]:
                 continue
@@ -190,12 +191,12 @@ def check_fields(instance: object, **expected: Any) -> None:
 
 @cache
 def _types(kind: Any) -> frozenset[type]:
-    """Return the types that a type, or a union of some, names: `isinstance` walks through a union."""
+    """Return the types of a union, or the single type: `isinstance` with a union is slow."""
     return frozenset(get_args(kind) or (kind,))
 
 
 def all_of(name: str, values: object, kind: type[T], most: int = 64) -> tuple[T, ...]:
-    """Return the values as a tuple if they are at most so many, and all of one kind.
+    """Return the values as a tuple if they are at most `most`, and all of one type.
 
     Examples
     --------
@@ -219,7 +220,7 @@ def _called(kind: Any) -> str:
 
 
 def _shown(value: object) -> str:
-    # A whole number of thousands of digits has no text.
+    # An integer with thousands of digits cannot be converted to text.
     return type(value).__name__ if isinstance(value, int) and abs(value) >= 1 << 63 else f"{value!r:.40}"
 
 

@@ -1,12 +1,12 @@
-"""Typed errors: each says what came and what was expected.
+"""Typed errors; each message contains the actual and the expected value.
 
-All are `ValueError`s with one common root, so that an embedder can catch `WorldstateError` and the command
-line can turn any of them into one line and exit code 2.
+All are `ValueError`s with one common root: a program can catch `WorldstateError`, and the command line turns
+any of them into one line and exit code 2.
 """
 
 
 class WorldstateError(ValueError):
-    """Root of every error that this library raises on purpose.
+    """Root of all errors that this library raises on purpose.
 
     Examples
     --------
@@ -20,7 +20,7 @@ class WorldstateError(ValueError):
 
 
 class InvalidArgumentError(WorldstateError):
-    """An argument has the wrong shape, range or type; the message names it.
+    """An argument has the wrong shape, range or type; the message contains its name.
 
     Examples
     --------
@@ -33,7 +33,7 @@ class InvalidArgumentError(WorldstateError):
 
 
 class OutOfDomainError(WorldstateError):
-    """An array, a sample rate or a feature is not what a model or a data set was made with.
+    """An array, a sample rate or a feature differs from that of a model or a data set.
 
     Examples
     --------
@@ -59,12 +59,12 @@ class InputFileError(WorldstateError):
         self.problem = problem
 
     def __reduce__(self) -> tuple[type, tuple[object, str]]:
-        # Pickle would call the class with the one text that it made, and break the pool of processes.
+        # Pickle would call the class with the one text that it made, which breaks the pool of processes.
         return type(self), (self.path, self.problem)
 
 
 class OwnPartError(WorldstateError):
-    """A part that an installed package brings failed; the message names it and what it raised.
+    """A part from another installed package failed; the message contains its name and the error.
 
     Examples
     --------
@@ -96,7 +96,7 @@ class SchemaVersionError(InputFileError):
 
 
 class MissingExtraError(WorldstateError):
-    """An optional package is not installed; the message names the extra that brings it.
+    """An optional package is not installed; the message contains the extra that installs it.
 
     Examples
     --------

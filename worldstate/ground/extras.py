@@ -1,4 +1,4 @@
-"""Optional packages: imported where they are used; an error names the extra that brings a missing one."""
+"""Optional packages, imported on use; the error for a missing package contains its extra."""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -6,7 +6,7 @@ from typing import Any
 
 from .errors import MissingExtraError
 
-# Import name: name on the package index, and the extra that brings it.
+# Import name: name on the package index, and the extra that installs it.
 EXTRAS = {
     "cv2": ("opencv-python-headless", "vision"),
     "distributed": ("distributed", "dask"),
@@ -48,7 +48,7 @@ def optional(module: str) -> Any:
 
 
 def check_extra(*modules: str) -> None:
-    """Refuse work of which an optional package is missing, before it begins; nothing is imported.
+    """Raise an error before work begins if an optional package is missing; nothing is imported.
 
     Raises
     ------

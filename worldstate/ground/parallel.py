@@ -1,4 +1,4 @@
-"""Independent work over processes, in order: what comes out does not depend on how many there are."""
+"""Independent work in processes, with results in order and independent of the number of processes."""
 
 import multiprocessing
 import os
@@ -17,7 +17,7 @@ from .errors import WorldstateError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-GRACE_S = 5.0  # to remove unfinished files
+GRACE_S = 5.0  # Time to remove unfinished files
 
 
 def in_processes(
@@ -30,9 +30,9 @@ def in_processes(
     >>> list(in_processes(abs, [-2, 1], jobs=1))
     [2, 1]
     """
-    # Processes are spawned, not forked: threads of a numerical library do not survive a fork.
-    # Not joblib's (1.6): it ends its workers with SIGKILL where an error or a signal ends the loop, so that
-    # half-written files stay, and the workers of a parent that was terminated went on for five minutes.
+    # Processes are spawned, not forked: threads of a numerical library do not survive a fork. joblib (1.6) is
+    # not used: after an error or a signal it ends its workers with SIGKILL, so half-written files stay, and
+    # the workers of a terminated parent ran for five more minutes.
     if jobs == 1 or len(items) <= 1:
         yield from map(work, items)
         return
@@ -40,14 +40,14 @@ def in_processes(
     others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(min(jobs, len(items)), context, _begin) as pool:
         try:
-            with _handled(signal.SIG_IGN, signal.SIGINT):  # The one that started processes ends them
+            with _handled(signal.SIG_IGN, signal.SIGINT):  # This process ends its workers itself
                 waiting = deque(pool.submit(_work_or_leave, work, item) for item in items)
             while waiting:
                 yield waiting.popleft().result()
         except BrokenProcessPool as error:
             raise WorldstateError("a process ended before its work was done: out of memory?") from error
         except BaseException:
-            # An error, Ctrl-C or SIGTERM: nothing waits for what the workers are at.
+            # After an error, Ctrl-C or SIGTERM, the work of the workers is not needed.
             for worker in set(multiprocessing.active_children()) - others:
                 worker.terminate()
             raise
@@ -56,7 +56,7 @@ def in_processes(
 def in_executor(
     executor: Executor, work: Callable[[Item], Result], items: Sequence[Item]
 ) -> Generator[Result, None, None]:
-    """Yield ``work(item)`` of any executor for every item, in the order of the items.
+    """Yield ``work(item)`` from any executor for every item, in the order of the items.
 
     Examples
     --------
@@ -75,8 +75,8 @@ def in_executor(
 
 
 def _begin() -> None:
-    """Let a worker end on SIGTERM, unfinished files removed, and when the process that started it is gone."""
-    # In this order: a signal in the middle of `start` would print a traceback.
+    """Prepare a worker to remove unfinished files and end on SIGTERM, and to end with its parent process."""
+    # In this order: a signal during `start` would print a traceback.
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGTERM, _terminate)
 
@@ -86,19 +86,19 @@ def _terminate(number: int, frame: object) -> None:
 
 
 def _end_with_parent() -> None:
-    # After a SIGKILL nothing tells the workers: they would wait for work until the machine is switched off.
+    # After a SIGKILL of the parent, no signal reaches the workers: they would wait for work for ever.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
-        # Between two pieces of work the pool takes the signal for an error of the last one and waits for the
-        # next, which never comes: once in some twenty runs a worker stayed.
+        # Between two items the pool takes the signal for an error of the last item and waits for the next
+        # one, which never comes: in one of some twenty runs a worker stayed.
         time.sleep(GRACE_S)
         os._exit(128 + signal.SIGTERM)
 
 
 def _work_or_leave(work: Callable[[Item], Result], item: Item) -> Result:
-    """Do the work; on SIGTERM remove unfinished files and end, where the pool would take the next item."""
+    """Do the work; on SIGTERM remove unfinished files and end, since the pool would take the next item."""
     try:
         return work(item)
     except SystemExit:
@@ -107,7 +107,7 @@ def _work_or_leave(work: Callable[[Item], Result], item: Item) -> Result:
 
 @contextmanager
 def _handled(handler: Callable[[int, object], object] | signal.Handlers, *numbers: int) -> Iterator[None]:
-    """Handle signals by a function while the block runs; outside the main thread as before."""
+    """Handle signals by a function while the block runs; outside the main thread nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -121,8 +121,8 @@ def _handled(handler: Callable[[int, object], object] | signal.Handlers, *number
 
 @contextmanager
 def deferred_signals() -> Iterator[None]:
-    """Hold SIGINT and SIGTERM back until files that belong together are all written."""
-    # A blocked signal would reach another thread of the process; its handler runs in the main one anyway.
+    """Delay SIGINT and SIGTERM until all files that belong together are written."""
+    # A blocked signal would reach another thread of the process; its handler runs in the main thread anyway.
     arrived: list[int] = []
     try:
         with _handled(lambda number, _: arrived.append(number), signal.SIGINT, signal.SIGTERM):

@@ -1,4 +1,4 @@
-"""One reader and one writer of frozen dataclasses, derived from their fields and type hints."""
+"""One reader and one writer for frozen dataclasses, derived from their fields and type hints."""
 
 import itertools
 import json
@@ -22,30 +22,30 @@ T = TypeVar("T")
 Hint: TypeAlias = Any
 Write: TypeAlias = Callable[[Any], Any]
 Read: TypeAlias = Callable[[Any], Any]
-# How values of a type are written, and how they are read.
+# The writer and the reader of a type.
 Plan: TypeAlias = tuple[Write, Read]
 
 MOST_CHARACTERS = 64 << 20
 _HALF = re.compile("[\ud800-\udfff]")
-# A list of two characters takes 80 bytes when decoded, so what bounds the memory is how many there are.
+# A list of two characters takes 80 bytes when decoded, so the number of values limits the memory.
 MOST_VALUES = 4_000_000
 MOST_ITEMS = 1_000_000
-_WORD = 1 << 63  # No whole number of 64 bits is as large
+_WORD = 1 << 63  # Larger than all integers of 64 bits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """What the fields of a class do not say of its JSON object: a class variable named ``LAYOUT``.
+    """JSON layout of a class beyond its fields, in a class variable ``LAYOUT``.
 
     Parameters
     ----------
     schema, version : str
-        Name and semantic version that the object is stamped with; none where empty.
+        Name and semantic version in the object; none if empty.
     constants : mapping of str to object
-        Keys with one value each, written first and expected when reading. A ``kind`` tells the members of a
-        union apart.
+        Keys with one value each, written first and required on reading. A ``kind`` distinguishes the members
+        of a union.
     order : str
-        Keys in the order in which they are written, where it is not that of the fields.
+        Keys in the order in which they are written, if it is not that of the fields.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
-    """An annotation: a value that was read has to hold this.
+    """An annotation: a value must meet this condition after reading.
 
     Examples
     --------
@@ -78,7 +78,7 @@ class Check:
 
     expected: str
     holds: Callable[[Any], object]
-    schema: Mapping[str, object] = field(default_factory=dict)  # The same in the words of JSON Schema
+    schema: Mapping[str, object] = field(default_factory=dict)  # The same condition in JSON Schema
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,15 +113,15 @@ _WITHIN_ONE = Check("a number in [0, 1]", lambda value: 0.0 <= value <= 1.0, {"m
 Probability: TypeAlias = Annotated[float, _WITHIN_ONE]
 Count: TypeAlias = Annotated[int, Check("a count", lambda value: value >= 0, {"minimum": 0})]
 
-# Metadata of a field: files of an earlier minor version do not hold it, and then its default stands.
+# Metadata of a field: files of an earlier minor version do not contain it, and its default is used.
 ADDED = {"added": True}
-# Metadata of a field: the keys of its dataclass stand among those of the one that holds it. A field with the
-# metadata "key" is written under that in place of its own name.
+# Metadata of a field: the keys of its dataclass are written among those of the outer one. A field with the
+# metadata "key" is written under that key instead of its own name.
 FLAT = {"flat": True}
 
 
 class _RefusedError(Exception):
-    """What is wrong with a value, and where; the place grows as it is passed outwards."""
+    """Problem with a value, and its place, which is completed as the error is passed outwards."""
 
     def __init__(self, problem: str, *, schema: bool = False) -> None:
         super().__init__(problem)
@@ -133,7 +133,7 @@ class _RefusedError(Exception):
 
 
 def encode(value: object) -> dict[str, Any]:
-    """Return a dataclass as JSON-able values.
+    """Return a dataclass as JSON-compatible values.
 
     Examples
     --------
@@ -147,12 +147,12 @@ def encode(value: object) -> dict[str, Any]:
 
 
 def decode(hint: type[T], data: object, where: str) -> T:
-    """Return the value of type `hint` that `encode` wrote; unknown keys are ignored.
+    """Return the value of type `hint` from the output of `encode`; unknown keys are ignored.
 
     Raises
     ------
     InvalidArgumentError
-        If a value is missing, not finite, of the wrong type or out of range; the message names its place.
+        If a value is missing, not finite, of the wrong type or out of range; the message contains its place.
     SchemaVersionError
         On another schema or another major version.
 
@@ -173,12 +173,12 @@ def decode(hint: type[T], data: object, where: str) -> T:
             raise SchemaVersionError(place, error.problem) from error
         raise InvalidArgumentError(f"{place}: {error.problem}") from error
     except RecursionError as error:
-        raise InvalidArgumentError(f"{where}: expected fewer lists within lists") from error
+        raise InvalidArgumentError(f"{where}: expected less deeply nested lists") from error
     return value
 
 
 def decode_json(text: str, where: str) -> object:
-    """Decode strict JSON: no NaN, no infinity, no half of a surrogate pair, bounded size and depth.
+    """Decode strict JSON: no NaN, no infinity, no half of a surrogate pair, limited size and depth.
 
     Examples
     --------
@@ -197,23 +197,23 @@ def decode_json(text: str, where: str) -> object:
 
 
 def decode_items(text: str, at: int, take: Callable[[object], object], where: str) -> int:
-    """Decode the list that begins at a place of a JSON text item by item, without a bound on their number.
+    """Decode a list inside a JSON text item by item, without a limit on their number.
 
     Parameters
     ----------
     text : str
-        The text, whose other parts are not looked at.
+        The text; other parts of it are not decoded.
     at : int
-        Place of the list's bracket.
+        Position of the list's opening bracket.
     take : callable
-        Is given each item.
+        Called with each item.
     where : str
-        Names the list in messages.
+        Name of the list in messages.
 
     Returns
     -------
     int
-        The place behind the list.
+        The position after the list.
 
     Examples
     --------
@@ -234,7 +234,7 @@ def decode_items(text: str, at: int, take: Callable[[object], object], where: st
 
 
 def _item(text: str, at: int) -> tuple[object, int]:
-    """Return the value that begins at a place, and its length: of what is far longer little is decoded."""
+    """Return the value at a position and its length; of a long text only a part is decoded."""
     for size in _WINDOWS:
         window = text[at : at + size]
         try:
@@ -254,10 +254,10 @@ def _behind_blanks(text: str, at: int) -> int:
 
 
 def _check_characters(value: object, text: str) -> None:
-    """Refuse half a surrogate pair, which has no bytes: it would fail where it is printed or written."""
+    """Raise an error for half a surrogate pair, which has no bytes and could not be printed or written."""
     shown = json.dumps(value, ensure_ascii=False) if "\\u" in text else text
     if not shown.isascii() and _HALF.search(shown):
-        raise ValueError("half a surrogate pair is no character")
+        raise ValueError("half a surrogate pair is not a character")
 
 
 @contextmanager
@@ -265,20 +265,20 @@ def _refused_as_json(where: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, RecursionError) as error:
-        raise InvalidArgumentError(f"{where}: expected JSON, got a text that is none ({error})") from error
+        raise InvalidArgumentError(f"{where}: expected JSON, got text that is not JSON ({error})") from error
 
 
 def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON number")
+    raise ValueError(f"{name} is not a JSON number")
 
 
 _BLANKS, _DECODER = (" ", "\t", "\n", "\r"), json.JSONDecoder(parse_constant=_refuse_constant)
-_WINDOWS = 1 << 11, 1 << 15, 1 << 22  # An item of a list: most are short, an image of 1,000 boxes is not
+_WINDOWS = 1 << 11, 1 << 15, 1 << 22  # For an item of a list: most are short, an image of 1,000 boxes is not
 
 
 @cache
 def _plan(hint: Hint) -> Plan:
-    """Compile how a type is written and read: once, as a snapshot is written ten times a second."""
+    """Compile the writer and the reader of a type, once: snapshots are written ten times per second."""
     origin: Any = get_origin(hint)
     args = get_args(hint)
     if origin is Annotated:
@@ -295,11 +295,11 @@ def _plan(hint: Hint) -> Plan:
         return _sequence(args[0]) if args[-1] is Ellipsis else _fixed(args)
     if origin is np.ndarray:
         return np.ndarray.tolist, _array(get_args(args[1])[0])
-    if origin is NDArray:  # from numpy 2.5 and Python 3.12 on a named type, which get_origin does not enter
+    if origin is NDArray:  # From numpy 2.5 with Python 3.12 on: a named type that get_origin does not resolve
         return np.ndarray.tolist, _array(args[0])
     if origin in (dict, Mapping):
         return _mapping(args[1])
-    raise TypeError(f"{hint} has no place in JSON")
+    raise TypeError(f"{hint} cannot be written as JSON")
 
 
 def _annotated(hint: Hint, notes: tuple[object, ...]) -> Plan:
@@ -317,7 +317,7 @@ def _as_is(value: Any) -> Any:
 
 
 def _then(read: Read, make: Callable[[Any], Any]) -> Read:
-    """Return the reader that makes something of what another reads; its own refusals keep their words."""
+    """Return a reader that converts the result of another reader and keeps its error messages."""
 
     def made(data: object) -> Any:
         value = read(data)
@@ -340,7 +340,6 @@ def _checked(read: Read, check: Check) -> Read:
 
 
 def _keyed(names: tuple[str, ...], hints: tuple[Hint, ...]) -> Plan:
-    """Return the plan of a fixed tuple that is written as an object."""
     plans = dict(zip(names, map(_plan, hints), strict=True))
 
     def write(parts: Any) -> dict[str, Any]:
@@ -354,7 +353,6 @@ def _keyed(names: tuple[str, ...], hints: tuple[Hint, ...]) -> Plan:
 
 
 def _record(cls: Any) -> Plan:
-    """Return the plan of a dataclass."""
     layout: Layout = getattr(cls, "LAYOUT", Layout())
     hints = get_type_hints(cls, include_extras=True)
     order = layout.order.split()
@@ -389,11 +387,11 @@ def _record(cls: Any) -> Plan:
 def _writer(
     layout: Layout, writers: dict[str, Write], flat: dict[str, Plan], keys: Mapping[str, str]
 ) -> Write:
-    """Return the function that writes a dataclass: fields that stand as they are first, for speed."""
+    """Return the writer of a dataclass; fields without conversion come first, for speed."""
     stamp = {"schema": {"name": layout.schema, "version": layout.version}} if layout.schema else {}
     constants, names = {**stamp, **layout.constants}, (*writers, *flat)
     changed = [(keys[name], write) for name, write in writers.items() if write is not _as_is]
-    # All at once, and never one alone, of which it would give no tuple.
+    # All in one call. A name is repeated, because a single name would give no tuple.
     written, values_of = [keys[name] for name in names], attrgetter(*names, *names[:1]) if names else None
 
     def write(value: Any) -> dict[str, Any]:
@@ -409,21 +407,21 @@ def _writer(
 
 
 def _check_schema(stamp: object, layout: Layout) -> None:
-    """Accept the named schema in any version of the same major number."""
+    """Accept the given schema in any version with the same major number."""
     name, version = (stamp.get("name"), stamp.get("version")) if isinstance(stamp, dict) else (None, None)
     major = layout.version.split(".")[0]
     if name != layout.schema or not isinstance(version, str) or version.split(".")[0] != major:
         got = f"{name} {version}"[:80] if isinstance(stamp, dict) else _shown(stamp)
         found, advice = str(version).split(".")[0], ""
         if name == layout.schema and found.isdecimal() and len(found) < 10:
-            advice = ": an earlier worldstate wrote it, write it anew with this one or read it with that one"
+            advice = ": written by an earlier worldstate; write it again with this version or use that one"
             if int(found) > int(major):
-                advice = ": a later worldstate wrote it, install that one to read it"
+                advice = ": written by a later worldstate; install that version to read it"
         raise _RefusedError(f"expected schema {layout.schema} {major}.x, got {got}{advice}", schema=True)
 
 
 def _union(hints: tuple[Hint, ...]) -> Plan:
-    """Return the plan of an optional value, or of dataclasses told apart by their kind."""
+    """Return the plan of an optional value, or of dataclasses that differ by their kind."""
     some = tuple(hint for hint in hints if hint is not type(None))
     if len(some) < len(hints):
         write, read = _plan(some[0]) if len(some) == 1 else _union(some)
@@ -449,7 +447,7 @@ def _maybe(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _kind(cls: Any) -> str | None:
-    """Return what tells a member of a union apart: its name, unless its layout says otherwise."""
+    """Return the kind of a union's member: its name, unless its layout gives another one."""
     kind: str | None = cls.LAYOUT.constants.get("kind") if hasattr(cls, "LAYOUT") else cls.__name__
     return kind
 
@@ -489,14 +487,15 @@ def _mapping(hint: Hint) -> Plan:
 
 
 def _array(scalar: type) -> Read:
-    """Return the reader of nested lists of numbers as an array of one dtype."""
+    """Return a reader that converts nested lists of numbers into an array of one dtype."""
     leaf = _whole if issubclass(scalar, np.integer) else _finite
 
     def nested(data: object) -> Any:
         if not isinstance(data, list | tuple):
             return leaf(data)
         items = _items(data)
-        # The shipped model has 640,000 numbers, an image up to 4,000: one by one they take most of the time.
+        # The shipped model has 640,000 numbers, an image up to 4,000; checks one by one would take most of
+        # the time.
         rows = {list, tuple} >= set(map(type, items)) > set() and max(map(len, items)) <= MOST_ITEMS
         numbers = list(itertools.chain.from_iterable(items)) if rows else items
         kinds = set(map(type, numbers))
@@ -516,7 +515,7 @@ def _array(scalar: type) -> Read:
 
 
 def _entry(entries: Any, key: Any, read: Read) -> Any:
-    """Read an entry of an object, None where it is missing, or an item of a list."""
+    """Read an entry of an object, None if it is missing, or an item of a list."""
     of_object = isinstance(entries, dict)
     try:
         return read(entries.get(key) if of_object else entries[key])

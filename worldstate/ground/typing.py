@@ -1,4 +1,4 @@
-"""Array types, one name each."""
+"""Array types with one name each."""
 
 from typing import Any, TypeAlias
 

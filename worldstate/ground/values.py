@@ -1,4 +1,4 @@
-"""Small values that every storey of the house speaks of."""
+"""Small values and functions for all packages."""
 
 import math
 from collections.abc import Callable
@@ -14,38 +14,38 @@ from .checks import check_fields
 from .errors import InvalidArgumentError
 from .typing import FloatArray, IndexArray
 
-# A float stays a float, an array an array.
+# A float gives a float, an array gives an array.
 T = TypeVar("T")
 RealT = TypeVar("RealT", float, FloatArray)
 
-# What a co-evidence channel last said of an entity: found, searched for and not found, not searched for.
+# Last answer of a co-evidence channel about an entity: found, searched for and not found, not searched for.
 Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 
-# Share of a hop that could be heard below which nothing of it is read.
+# Below this share of noticed vehicles a hop is not used as evidence.
 LEAST_HEARD = 0.2
 
-# Keeps logarithms and quotients finite: of a probability, or of a share, that is none.
+# Keeps logarithms and quotients finite if a probability or a share is zero.
 TINY = 1e-12
-# Log-odds of certainty: e^-20 is once in fifteen years of hops.
+# Log-odds of certainty: e^-20 corresponds to one hop in 1.5 years.
 CERTAIN_NATS = 20.0
 
 _TURN = 2.0 * math.pi
 NANOSECONDS_PER_SECOND = 1_000_000_000
 SECONDS_PER_HOUR = 3600.0
-# Of signed 64 bits, less an hour: what is derived from a stamp, as the end of an advisory, is written too.
+# Signed 64 bits less one hour, because later times, such as the end of an advisory, are written too.
 _MOST_NS = (1 << 63) - 3600 * NANOSECONDS_PER_SECOND
 
 
 @dataclass(frozen=True, slots=True)
 class NotUsable:
-    """An estimate that was asked for and cannot be given, with the reason.
+    """A requested estimate that is not available, with the reason.
 
-    It is neither zero nor missing: a fusion must marginalise the quantity.
+    It is neither zero nor missing: a fusion must marginalise over the quantity.
 
     Parameters
     ----------
     reason : str
-        Why it cannot be given.
+        Why it is not available.
 
     Examples
     --------
@@ -74,11 +74,11 @@ def falling(value: float, between: tuple[float, float]) -> float:
 @cache
 def _fields_of(cls: Any) -> tuple[tuple[str, ...], Callable[[Any], tuple[Any, ...]]]:
     names = tuple(one.name for one in fields(cls) if one.init)
-    return names, attrgetter(*names, names[0])  # Of one name alone it would give no tuple
+    return names, attrgetter(*names, names[0])  # A single name would give no tuple
 
 
 def replaced(value: T, /, **changes: Any) -> T:
-    """Return a dataclass with some fields changed: `dataclasses.replace` without a call for every field.
+    """Return a dataclass with some fields changed, like `dataclasses.replace` but without a call per field.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def replaced(value: T, /, **changes: Any) -> T:
 
 
 def mean(values: np.ndarray, axis: int | None = None, dtype: Any = None) -> Any:
-    """Arithmetic mean: that of `numpy.mean` to the bit, in two calls in place of nine.
+    """Return the arithmetic mean, equal to `numpy.mean` to the bit, in two calls instead of nine.
 
     Examples
     --------
@@ -104,7 +104,7 @@ def mean(values: np.ndarray, axis: int | None = None, dtype: Any = None) -> Any:
 
 
 def median(values: np.ndarray) -> Any:
-    """Median over the last axis, which holds no NaN: that of `numpy.median` in a tenth of its calls.
+    """Return the median over the last axis without NaN, like `numpy.median` in a tenth of its calls.
 
     Examples
     --------
@@ -124,7 +124,7 @@ def _parts(size: int, parts: int) -> tuple[IndexArray, IndexArray]:
 
 
 def part_means(values: FloatArray, parts: int) -> FloatArray:
-    """Means over neighbours along the last axis, in so many parts as `numpy.array_split` cuts them.
+    """Return means over neighbours along the last axis, in the parts of `numpy.array_split`.
 
     Examples
     --------
@@ -136,7 +136,7 @@ def part_means(values: FloatArray, parts: int) -> FloatArray:
 
 
 def significant(values: FloatArray, figures: int) -> FloatArray:
-    """Round to so many significant figures: what a file of coefficients need not hold.
+    """Round to some significant figures, which makes files of coefficients shorter.
 
     Examples
     --------
@@ -166,15 +166,15 @@ def wrap_angle(angle_rad: RealT) -> RealT:
     (-1.571, True)
     """
     if type(angle_rad) is float or isinstance(angle_rad, float):
-        # Ten times as fast as an array of one angle, of which a step of the filter has hundreds.
+        # Ten times as fast as an array of one angle; a step of the filter wraps hundreds of single angles.
         return math.pi - (math.pi - float(angle_rad)) % _TURN % _TURN
-    # Taken twice: of the least that is negative the first is rounded to a whole turn.
+    # Applied twice: for the smallest negative number the first result is rounded to a whole turn.
     wrapped = np.pi - (np.pi - np.asarray(angle_rad, dtype=np.float64)) % _TURN % _TURN
     return wrapped if wrapped.ndim else float(wrapped)  # type: ignore[return-value]
 
 
 def vertex(left: float, middle: float, right: float) -> float:
-    """Place of the highest point of a parabola through three points, in steps from the second; 0 without one.
+    """Return the vertex of a parabola through three points, in steps from the second; 0 without a maximum.
 
     Examples
     --------
@@ -225,13 +225,13 @@ def nanoseconds(time_s: float) -> int:
     1500000000
     """
     time_ns = time_s * NANOSECONDS_PER_SECOND
-    if not abs(time_ns) < 1 << 63:  # Of NaN, too
+    if not abs(time_ns) < 1 << 63:  # Also true of NaN
         raise InvalidArgumentError(f"time: expected nanoseconds of 64 bits, got {time_s:g} s")
     return round(time_ns)
 
 
 def integer_ns(name: str, value: object) -> int:
-    """Return a time stamp as a Python integer; it fits signed 64 bits with an hour to spare.
+    """Return a time stamp as a Python integer, within signed 64 bits with an hour to spare.
 
     Examples
     --------

@@ -1,3 +1,3 @@
-"""The version, in one place: packaging, the command line and what is written to files read it here."""
+"""The version number, for packaging, the command line and written files."""
 
 __version__ = "0.3.0"
