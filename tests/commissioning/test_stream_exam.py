@@ -420,7 +420,7 @@ def test_two_junctions_keep_for_another_what_neither_of_them_has() -> None:
 
 
 def test_one_junction_sets_no_alarm_for_others() -> None:
-    with pytest.raises(InvalidArgumentError, match="2 junctions at least, got 1"):
+    with pytest.raises(InvalidArgumentError, match="at least 2 junctions, got 1"):
         measured_curve(levels(0, 1, 3), elsewhere=True)
 
 

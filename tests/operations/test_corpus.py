@@ -154,7 +154,7 @@ def test_thresholds_are_set_on_hops_as_on_the_sound_itself(demo, tmp_path, capsy
     assert rising_edges(raised).size == len(report.warning.advisory_onsets_s)
     words = ["model", "threshold", str(folder / "heard"), "--out", str(tmp_path / "mine.json")]
     assert main(words) == 2
-    assert "budget: expected 0.10 hours for 30 onsets an hour, got 0.00" in capsys.readouterr().err
+    assert "budget: expected 0.10 hours for 30 onsets per hour, got 0.00" in capsys.readouterr().err
     assert main([*words, "--budget", "1200"]) == 0
     assert read_model(tmp_path / "mine.json").sequence.curve.hours == pytest.approx(report.hops / 36_000)
 

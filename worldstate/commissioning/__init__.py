@@ -1,1 +1,1 @@
-"""Models for an array of one's own: streets simulated, listened to, learned from and examined."""
+"""Models for a user's own array: simulated streets, processed sound, training and exam."""

@@ -1,12 +1,12 @@
-r"""The curve from budget to threshold: hazard-free streams through the filter, counted at every threshold.
+r"""Curve from budget to threshold: onsets on hazard-free streams in the filter, at every threshold.
 
-An onset is the hop at which an alarm of either side begins. Rates of junctions differ: with the square
+An onset is the hop at which an alarm of either side begins. Rates differ between junctions. With the square
 :math:`\kappa` of their coefficient of variation, n onsets at J junctions leave the mean rate at K others as
-uncertain as that of one Poisson process is after
+uncertain as that of one Poisson process after
 
 .. math:: m = \Big( \frac{1}{n} + \frac{\kappa}{J} + \frac{\kappa}{K} \Big)^{-1}
 
-onsets, whose exact interval is taken.
+onsets, whose exact interval is used.
 
 Source: J. Hilbe, "Negative binomial regression", 2011.
 """
@@ -40,15 +40,15 @@ from worldstate.state import WorldState
 from .guard_training import heard_characters
 from .heard_stream import HeardStream
 
-# With fewer expected onsets a threshold is set by chance alone.
+# With fewer expected onsets a threshold depends on chance alone.
 LEAST_ONSETS = 3.0
-# A junction counts for no more than so many times the onsets that are asked for. Up to 2, 3, 4 and 6 times at
-# 20 an hour leave .22, .17, .13 and .08 of other junctions above that, and detect .888, .881, .870 and .849.
+# A junction counts for at most this many times the requested onsets. At 20 per hour, limits of 2, 3, 4 and 6
+# leave 22, 17, 13 and 8 % of other junctions above 20, and detect 88.8, 88.1, 87.0 and 84.9 % of approaches.
 LOUDEST = 3.0
-ELSEWHERE = 4  # Junctions of a way: at one alone rates differ by a factor of three either way
-UNREACHED = SequenceAlarm(1e6, 1.0)  # At this threshold nothing changes what is compared
+ELSEWHERE = 4  # Junctions of a route; at a single one rates differ by a factor of three either way
+UNREACHED = SequenceAlarm(1e6, 1.0)  # No alarm reaches this threshold, so it has no effect
 _LEAST, _QUANTILE = 1e-9, 0.75
-_POINTS, _MOST_SHARE = 200, 0.3  # Thresholds, down to one that so large a share of the hops reaches
+_POINTS, _MOST_SHARE = 200, 0.3  # Number of thresholds; the lowest is reached by this share of the hops
 HELD_HOURS = HELD_HOPS * HOP_S / SECONDS_PER_HOUR
 
 
@@ -61,9 +61,9 @@ def measurements(
     street: StreetListener | None = None,
     guard: DomainGuard | None = None,
 ) -> Iterator[Measurement]:
-    """Yield one measurement a hop, as the acoustic adapter makes them of the sound.
+    """Yield one measurement per hop, like the acoustic adapter.
 
-    `street` corrects the sides, and learns from the passes that the filter reports to it.
+    `street` corrects the sides and learns from the passes that the filter reports to it.
     """
     domains = _judged(heard, guard)
     if guard is not None:
@@ -94,7 +94,7 @@ def measurements(
 
 
 def _judged(heard: HeardStream, guard: DomainGuard | None) -> list[DomainVerdict | None]:
-    """Return the verdict of the guard on every hop, None before it has heard enough."""
+    """Return the guard's verdict on every hop; None before it has enough sound."""
     if guard is None:
         return [None] * len(heard.hops)
     rows, usable = heard_characters(heard)
@@ -122,7 +122,7 @@ def stream_states(
     guard: DomainGuard | None = None,
     street: StreetModel | None = None,
 ) -> Iterator[WorldState]:
-    """Yield the snapshot of every hop of a stream without a camera, by the numbers of `street`."""
+    """Yield the snapshot of every hop of a stream without a camera, with the parameters `street`."""
     world = WorldFilter(settings=FilterSettings(street=street or StreetModel()))
     for measurement in measurements(heard, windows, sequence, evidence, guard=guard):
         world = world.update(measurement)
@@ -130,16 +130,17 @@ def stream_states(
 
 
 def advised(states: Iterable[WorldState]) -> BoolArray:
-    """Return whether there is an advisory of each side at every hop, left and right, shape (n, 2)."""
+    """Return whether each side, left and right, has an advisory at every hop, shape (n, 2)."""
     told = ({cue.direction for cue in one.cues if cue.advisory is not None} for one in states)
     return np.array([[side in sides for side in SIDES] for sides in told])
 
 
 def alarm_levels(states: Iterable[WorldState], street: StreetModel | None = None) -> FloatArray:
-    """Return the threshold up to which the alarm of each side is raised at every hop, shape (n, 2).
+    """Return the highest threshold that raises the alarm of each side at every hop, shape (n, 2).
 
-    Of states with the alarm `UNREACHED`, by the numbers of `street`: the filter's own log-odds, less what
-    raises its threshold just then; minus infinity if too little was heard or the risk denies an alarm.
+    The states must have the alarm `UNREACHED` and the parameters `street`. The value is the filter's log-odds
+    less the present rise of its threshold. It is minus infinity if there was too little sound, or if the risk
+    contradicts an alarm.
     """
     denied = (street or StreetModel()).death
     levels = [[alarm_level(state, side, denied, UNREACHED) for side in SIDES] for state in states]
@@ -147,15 +148,15 @@ def alarm_levels(states: Iterable[WorldState], street: StreetModel | None = None
 
 
 def check_hours(name: str, hours: float, onsets_per_hour: float) -> None:
-    """Refuse fewer hours than an alarm can be set on."""
+    """Raise an error for fewer hours than an alarm can be set on."""
     if hours * onsets_per_hour < LEAST_ONSETS:
-        wanted = f"{LEAST_ONSETS / onsets_per_hour:.2f} hours for {onsets_per_hour:g} onsets an hour"
-        problem = f"expected {wanted}, got {hours:.2f}: more sound, or more onsets allowed"
+        wanted = f"{LEAST_ONSETS / onsets_per_hour:.2f} hours for {onsets_per_hour:g} onsets per hour"
+        problem = f"expected {wanted}, got {hours:.2f}; use more sound, or allow more onsets"
         raise InvalidArgumentError(f"{name}: {problem}")
 
 
 def raised_at(levels: FloatArray, threshold_nats: float) -> BoolArray:
-    """Return whether an alarm of any side stands at every hop, for a second unless denied, shape (n,)."""
+    """Return whether any side has an alarm at every hop, shape (n,); it lasts a second unless denied."""
     sides = levels.reshape(len(levels), -1)
     at = np.arange(len(sides))[:, None]
     last, denied = (
@@ -166,31 +167,31 @@ def raised_at(levels: FloatArray, threshold_nats: float) -> BoolArray:
 
 
 def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool = False) -> AlarmCurve:
-    r"""Count the onsets of hazard-free streams and the hops in alarm at ever lower thresholds.
+    r"""Count onsets and hops in alarm on hazard-free streams, at decreasing thresholds.
 
-    With `elsewhere` the rate of a point is the smallest budget b that a junction not among these may be
-    expected to keep there (A. Angelopoulos et al., "Conformal risk control", ICLR 2024, eq. 4),
+    With `elsewhere`, the rate of a point is the smallest budget b that another junction is expected to keep
+    (A. Angelopoulos et al., "Conformal risk control", ICLR 2024, eq. 4),
 
     .. math:: \frac{1}{J + 1} \Big( L b + \sum_{j=1}^J \min(r_j, L b) \Big) \le b, \qquad L = 3
 
-    with r the most onsets an hour of junction j so far, and the interval of the mean rate reaches up to it;
-    else it is the rate of all hours together.
+    with r the most onsets per hour of junction j so far. The interval of the mean rate is extended to this
+    rate. Without `elsewhere`, it is the rate of all hours together.
 
     Parameters
     ----------
     quiet : mapping of str to sequences of arrays, each of shape (hops, sides)
-        `alarm_levels` of the streams of each junction; of a single level shape (hops,).
+        `alarm_levels` of the streams of each junction; shape (hops,) for a single level.
     elsewhere : bool
-        Whether the rate is that of another junction.
+        Whether the rate is for another junction.
 
     Raises
     ------
     InvalidArgumentError
-        If there is no stream, or of other junctions fewer than two.
+        If there is no stream, or with `elsewhere` if there are fewer than two junctions.
     """
     streams = [one for there in quiet.values() for one in there]
     if not streams or (elsewhere and len(quiet) < LOUDEST - 1.0):
-        raise InvalidArgumentError(f"quiet: expected {LOUDEST - 1:g} junctions at least, got {len(quiet)}")
+        raise InvalidArgumentError(f"quiet: expected at least {LOUDEST - 1:g} junctions, got {len(quiet)}")
     first = np.cumsum([0, *map(len, list(quiet.values())[:-1])])
     thresholds = _thresholds(np.concatenate(streams))
     raised = [[raised_at(one, level) for level in thresholds.tolist()] for one in streams]
@@ -198,18 +199,18 @@ def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool
     hops = np.add.reduceat([len(one) for one in streams], first)
     share = np.sum([[on.sum() for on in stream] for stream in raised], axis=0) / hops.sum()
     hours = hops * HOP_S / SECONDS_PER_HOUR
-    # Onsets may fall as alarms that grow together become one.
+    # Onsets may decrease at lower thresholds, because neighbouring alarms merge.
     worst = np.maximum.accumulate(onsets / hours[:, None], axis=1)
     counted = np.maximum.accumulate(onsets.sum(axis=0))
     rates = budgets_elsewhere(worst) if elsewhere else counted / hours.sum()
-    # No alarm lasts less than a second: a larger budget is none, of two junctions nearly every one.
+    # No alarm is shorter than a second, so larger budgets have no meaning.
     known = rates <= SECONDS_PER_HOUR
     thresholds, rates, counted, share = (one[known] for one in (thresholds, rates, counted, share))
     fewer = 1.0 + _variation(onsets, hours) * (1.0 / ELSEWHERE + 1.0 / len(hours)) * counted
     intervals = [poisson_interval(*one) for one in zip(counted / fewer, hours.sum() / fewer, strict=True)]
     onsets_between = np.maximum.accumulate(intervals, axis=0).T
     onsets_between[1] = np.maximum(onsets_between[1], rates)
-    # An alarm lasts as long elsewhere; until the first one, as long as it is held.
+    # Alarms elsewhere have the same mean length; before the first one, the length is the holding time.
     lasts = np.divide(share * hours.sum(), counted, np.full(share.shape, HELD_HOURS), where=counted > 0)
     share_between = np.maximum.accumulate(np.minimum(onsets_between * lasts, 1.0), axis=1)
     (low, high), (share_low, share_high) = onsets_between, share_between
@@ -218,7 +219,7 @@ def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool
 
 
 def _thresholds(levels: FloatArray) -> FloatArray:
-    """Return thresholds from one that nothing reaches downwards."""
+    """Return decreasing thresholds; no level reaches the first one."""
     highest = levels.reshape(len(levels), -1).max(axis=1)
     known = np.sort(highest[np.isfinite(highest)])[::-1]
     ranks = np.unique(np.geomspace(1, max(_MOST_SHARE * highest.size, 1), _POINTS).astype(np.intp))
@@ -227,19 +228,20 @@ def _thresholds(levels: FloatArray) -> FloatArray:
 
 
 def budgets_elsewhere(worst: FloatArray) -> FloatArray:
-    """Return the smallest budget that another junction keeps at every threshold.
+    """Return the smallest budget that another junction keeps, at every threshold.
 
-    With the m loudest junctions cut off it is the sum of the others over J + 1 - L (m + 1), the least of all.
+    With the m loudest junctions cut off, it is the sum of the others over J + 1 - L (m + 1); the least
+    counts.
 
-    Shapes: worst (junctions, thresholds), the most onsets an hour so far.
+    Shapes: worst (junctions, thresholds), the most onsets per hour so far.
     """
     junctions = len(worst)
     fewer = np.sort(worst, axis=0)[::-1]
     others = fewer.sum(axis=0) - np.concatenate([np.zeros((1, fewer.shape[1])), np.cumsum(fewer, axis=0)])
     left = junctions + 1 - LOUDEST * np.arange(1, junctions + 2)
-    # Of two junctions nothing is cut off, and only what neither of them has is kept.
+    # With two junctions nothing is cut off, so only a threshold without onsets at both is kept.
     least = (others[left >= 0.0] / np.maximum(left[left >= 0.0, None], _LEAST)).min(axis=0)
-    # More onsets ask for no smaller budget, but sums of many junctions are rounded.
+    # More onsets never require a smaller budget, but sums over many junctions are rounded.
     return np.asarray(np.maximum.accumulate(np.maximum(least, 0.0)))
 
 
@@ -251,7 +253,7 @@ def _variation(onsets: FloatArray, hours: FloatArray) -> float:
         return 0.0
     expected, counts, others = expected[:, known], onsets[:, known], 1.0 - hours[:, None] / hours.sum()
     excess = (np.square(counts - expected) / others - expected).sum(axis=0) / np.square(expected).sum(axis=0)
-    # It is hardly known of a dozen junctions: with the upper quartile over the thresholds the interval of one
-    # other junction holds its rate in 0.88 to 0.94 of 1500 draws of gamma distributions, with the median in
-    # 0.80 to 0.92.
+    # A dozen junctions hardly determine it. With the upper quartile over the thresholds, the interval for one
+    # other junction contains its rate in 88 to 94 % of 1500 draws of gamma distributions; with the median, in
+    # 80 to 92 %.
     return max(float(np.quantile(excess, _QUANTILE)), 0.0)

@@ -1,4 +1,4 @@
-"""From an array to a model: streets simulated and listened to, window and sequence model, alarm, exam."""
+"""From an array to a model: simulate streets, process their sound, train, set the alarm and examine."""
 
 import hashlib
 import json
@@ -70,28 +70,28 @@ from .simulated_windows import (
 from .stream_exam import ExaminedStream
 
 FOLDS = 4
-# Windows and trees of every fold, alarm, window model, sounds near by, guard; of the minutes of the streams:
-# of 8 microphones all of it takes two thirds as long as they do.
+# Time of learning relative to the streams, and its steps: windows and trees of every fold, alarm, window
+# model, sounds near by, guard. With 8 microphones it takes two thirds of the time of the streams.
 LEARNING_SHARE, LEARNING_STEPS = 0.65, 2 * FOLDS + 4
-# So many hours of streams bear all trees, fewer in proportion, and so many rounds at least: of eight minutes
-# 20, 60 and 120 have a Brier skill at 3 s of 0.04, -0.12 and -0.13 at a junction that was not learned.
+# This many hours of streams allow all trees; fewer hours allow proportionally fewer, down to a minimum. With
+# eight minutes, 20, 60 and 120 rounds have a Brier skill at 3 s of 0.04, -0.12 and -0.13 at a new junction.
 HOURS_OF_TREES, LEAST_ROUNDS = 2.0, 20
-SOUNDS = 1  # Purpose of a generator
-# Road users are heard with one microphone: sounds are rendered once for all arrays, in their middle.
+SOUNDS = 1  # Seed of the generator for sounds
+# Road users are recorded by one microphone in the middle, so their sounds are rendered once for all arrays.
 MIDDLE = MicrophoneArray(np.array([[0.0, 0.01, 0.0], [0.0, -0.01, 0.0]]))
 SIMULATED = "simulated streets"
 STREETS = DataSource(SIMULATED, "coefficients", "Apache-2.0: the simulation is a part of this project")
-# Guard and road users; see what was chosen in `guard_training`.
+# Data for the thresholds of guard and road users; the thresholds are in `guard_training`.
 CHOSEN_ON = (
     DataSource("82 recordings of passing cars and trams", "thresholds"),
     DataSource("195 recordings of buses and trams", "thresholds", "CC0-1.0"),
 )
-# Of hazard-free to approaching time in use: two hours to 72 minutes, as in the exam.
+# Share of hazard-free time in use: two hours to 72 minutes of approaches, as in the exam.
 HAZARD_FREE_SHARE = 120.0 / 192.0
 
 
 def learning_minutes(settings: CommissionSettings) -> float:
-    """Return what learning is worth beside the streams, in minutes of streams."""
+    """Return the cost of learning, expressed in minutes of streams."""
     return LEARNING_SHARE * sum(one.minutes for one in learned_streams(settings))
 
 
@@ -106,10 +106,10 @@ def heard_streams(
     jobs: int = 1,
     beside: Sequence[MicrophoneArray] = (),
 ) -> Generator[HeardStream, None, None]:
-    """Yield every stream of a plan, listened to now or, by the same settings and array, before.
+    """Yield every stream of a plan, processed now or, with the same settings and array, before.
 
-    What is rendered now is heard and kept for the arrays beside, too: a small one adds a sixth of
-    what it takes alone.
+    A newly rendered stream is also processed and stored for the arrays `beside`; a small array adds a sixth
+    of the time that it takes alone.
     """
     folder.mkdir(parents=True, exist_ok=True)
     arrays = [array, *beside]
@@ -123,7 +123,7 @@ def _heard(
     folder: Path,
     settings: StreamSettings,
 ) -> list[HeardStream]:
-    """Return what the first array hears, as each that it is believed to be; keep what all of them hear."""
+    """Return the first array's processed streams, one per assumed version; store those of all arrays."""
     paths = [
         [_path(one, other, folder, settings) for other in some]
         for one, some in zip(arrays, believed, strict=True)
@@ -137,7 +137,7 @@ def _heard(
 
 
 def _path(array: MicrophoneArray, believed: MicrophoneArray, folder: Path, settings: StreamSettings) -> Path:
-    # Whatever else is heard under the same name, by another array or preset, is another file.
+    # A stream of the same name from another array or preset gets a file of its own.
     places = [array.positions_m.tolist()]
     if believed is not array:
         places.append(believed.positions_m.tolist())
@@ -146,7 +146,7 @@ def _path(array: MicrophoneArray, believed: MicrophoneArray, folder: Path, setti
 
 
 def stream_evidence(model: EnsembleModel, heard: HeardStream) -> FloatArray:
-    """Return what a window model says along a stream, and what else the front-end heard."""
+    """Return the evidence along a stream, from a window model and the front-end."""
     hops, posteriors = heard.hops, posteriors_along(model, heard.hops.feature)
     return hop_columns(
         side_ratios(posteriors, model.classes, model.class_prior),
@@ -168,10 +168,11 @@ def learn_sequence(
     jobs: int = 1,
     on_step: Callable[[str], None] = lambda stage: None,
 ) -> SequenceModel:
-    """Train a sequence model on streams, junction by junction out of fold.
+    """Train a sequence model on streams, with evidence from models without the junction of the stream.
 
-    `fit_windows` makes a window model of some of the streams. Evidence of a stream always comes from one that
-    did not learn its junction: trained on evidence that is too good, trees trust it too much elsewhere.
+    `fit_windows` trains a window model on some of the streams. The evidence of a stream always comes from a
+    model that was not trained on its junction. Otherwise it would be too good, and trees would trust it too
+    much elsewhere.
     """
     evidence, folds, fitted = dict[int, FloatArray](), _folds(streams), list[EnsembleModel]()
     for outside in folds:
@@ -204,7 +205,7 @@ def learn_sequence(
 
 
 def dealt_growth(streams: Sequence[HeardStream]) -> list[Growth]:
-    """Return the trees that so much sound bears."""
+    """Return the sizes of trees for this amount of sound."""
     hours = sum(len(one.hops) for one in streams) * HOP_S / SECONDS_PER_HOUR
     share = min(hours / HOURS_OF_TREES, 1.0)
     sizes = MOVING if streams[0].ego_moves else STANDING
@@ -223,7 +224,7 @@ def _learned(
 
 
 def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:
-    """Return the streams of every fold; junctions in turn, pairs of both types where there are enough."""
+    """Return the streams of every fold: junctions in turn, in pairs of both types if there are enough."""
     names = sorted({one.site for one in streams}, key=lambda name: (name[2:], name))
     together = 2 if len(names) >= 2 * FOLDS else 1
     folds = [names.index(one.site) // together % FOLDS for one in streams]
@@ -231,7 +232,7 @@ def _folds(streams: Sequence[HeardStream]) -> list[list[int]]:
 
 
 def stream_weights(streams: Sequence[HeardStream]) -> FloatArray:
-    """Return what a hop of each stream counts, so that hazard-free time has its share of use."""
+    """Return the weight of a hop of each stream, such that hazard-free time has the same share as in use."""
     free = np.array([one.hazard_free for one in streams])
     hops = np.array([len(one.hops) for one in streams])
     quiet = HAZARD_FREE_SHARE / max(hops[free].sum(), 1)
@@ -254,21 +255,20 @@ def commission(
     jobs: int = 1,
     on_step: Callable[[str, float], None] = lambda stage, minutes: None,
 ) -> Model:
-    """Make a model for an array from simulated streets, and from labelled windows where there are any.
+    """Train a model for an array on simulated streets, and on labelled windows if there are any.
 
-    Streams are heard and kept in the folder for the arrays beside, too. `on_step` is called with what is done
-    next and with what was done meanwhile, in minutes of streams (`learning_minutes` are all).
+    Streams are also processed and stored for the arrays `beside`. `on_step` is called with the next stage and
+    with the finished work in minutes of streams; learning takes `learning_minutes`.
 
-    The card names every source by use, the labelled windows with their licence, and what a simulated exam is
-    worth on real recordings.
-    Recordings without vehicles set the alarm in place of the simulated streets without hazards; guard and
-    road users are learned from recorded clips as well. The model says where the labelled windows and the
-    clips come from and which lists of windows were left out.
+    The model's card lists every source by use, the labelled windows with their licence, and a comparison of
+    simulated exams with real recordings. Recordings without vehicles set the alarm instead of simulated
+    hazard-free streets; guard and road users are trained on recorded clips as well. The model contains the
+    origin of labelled windows and clips, and the excluded lists of windows.
     """
     check_extra("sklearn")
     streams, rng = list[HeardStream](), np.random.default_rng(settings.seed)
     plan = learned_streams(settings)
-    # What is a user's own is read and checked before hours of streets are simulated.
+    # The user's own data are read and checked before hours of streets are simulated.
     domain, real = own_windows(array, settings, table)
     calm = quiet_streams(quiet, array, settings.onsets_per_hour) if quiet else []
     on_step("streets", 0.0)
@@ -292,8 +292,8 @@ def commission(
         excluded_lists=(*excluded_lists, *settings.leave_out),
         simulated=simulated,
     )
-    # What streets sound like is learned from several of them: two are none that are left out. With recorded
-    # clips it is tried all the same, beside two simulated ones a kind.
+    # The guard leaves some streets out during its training, for which two streets are too few. With recorded
+    # clips it is trained anyway, with two simulated clips per kind.
     if recorded is not None or not settings.quick:
         learned("sounds near by")
         model = _with_ears(model, array, streams, recorded, settings, jobs, learned)
@@ -315,9 +315,9 @@ def commission(
 
 
 def real_figures(array: MicrophoneArray, *, moving_ego: bool = False) -> tuple[RealFigure, ...]:
-    """Return what figures of an exam are on real recordings of an array, as the model that ships has them.
+    """Return the exam figures on real recordings for an array, as in the shipped model.
 
-    Those of the roof array and an ego that stands are its own; any other model has the gap of the pair alone.
+    The roof array with an ego vehicle at rest has its own figures. Other models get those of two microphones.
     """
     known = read_model()
     roof = known.domain is not None and microphone_order(known.domain.positions_m, array) is not None
@@ -334,7 +334,7 @@ def _with_ears(
     jobs: int,
     learned: Callable[[str], None],
 ) -> Model:
-    """Return a model with a guard and kinds of road users, learned close by and in the streets."""
+    """Return a model with a guard and classes of road users, trained on sounds near by and in streets."""
     rate_hz: float = streams[0].hops.about["sample_rate_hz"]
     sites = tuple(dict.fromkeys(one.site for one in streams))
     close, passes = _sounds(rate_hz, sites, settings.seed, 2 if settings.quick else CLIPS_EACH, jobs)
@@ -359,7 +359,7 @@ def _sounds(
 
 
 def quiet_streams(quiet: Sequence[Path], array: MicrophoneArray, onsets_per_hour: float) -> list[HeardStream]:
-    """Hear recordings without vehicles; refuse fewer hours than an alarm can be set on."""
+    """Process recordings without vehicles; raise an error for fewer hours than an alarm can be set on."""
     heard = [hear_recording(path, array) for path in quiet]
     hours = sum(len(one.hops) for one in heard) * HOP_S / SECONDS_PER_HOUR
     check_hours("quiet", hours, onsets_per_hour)
@@ -367,7 +367,7 @@ def quiet_streams(quiet: Sequence[Path], array: MicrophoneArray, onsets_per_hour
 
 
 def levels_of(model: Model, heard: HeardStream) -> FloatArray:
-    """Return the `alarm_levels` of a stream by the model as it would be used, shape (hops, 2)."""
+    """Return the `alarm_levels` of a stream from the complete model, shape (hops, 2)."""
     windows, sequence = parts_of(model)
     evidence, silent = stream_evidence(windows, heard), replace(sequence, alarm=UNREACHED)
     states = stream_states(heard, windows, silent, evidence, model.guard, model.street)
@@ -375,22 +375,22 @@ def levels_of(model: Model, heard: HeardStream) -> FloatArray:
 
 
 def with_curve(model: Model, curve: AlarmCurve, onsets_per_hour: float) -> Model:
-    """Return a model with a curve and the budget that is taken if none is asked for."""
+    """Return a model with a curve and its default budget."""
     _, sequence = parts_of(model)
     return replace(model, sequence=replace(sequence, alarm=curve.default(onsets_per_hour), curve=curve))
 
 
 def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
-    """Return the window and the sequence model of a file that holds both, as `commission` makes them."""
+    """Return the window model and the sequence model of a model that `commission` made."""
     if model.sequence is None or not isinstance(model.signature, EnsembleModel):
-        raise InvalidArgumentError("model: expected one with a sequence, as `commission` makes")
+        raise InvalidArgumentError("model: expected a model with a sequence, as from `commission`")
     return model.signature, model.sequence
 
 
 def own_windows(
     array: MicrophoneArray, settings: CommissionSettings, table: FeatureTable | None
 ) -> tuple[ModelDomain, FeatureTable | None]:
-    """Return what a model of an array is made for, and which labelled windows it may learn."""
+    """Return the domain of a model for an array, and the labelled windows that it may learn."""
     plan = learned_streams(settings)
     domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
     domain = replace(domain, fastest_mps=max(one.ego.speed_mps for one in plan) or None)
@@ -405,20 +405,20 @@ def windows_to_learn(
     rng: np.random.Generator,
     jobs: int = 1,
 ) -> WindowsOf:
-    """Return what names the windows that are learned of some streams, with sources in the open beside."""
+    """Return a function from streams to their training windows, with sources in the open added."""
     number = N_OPEN // 10 if settings.quick else N_OPEN
     open_field = open_field_windows(open_field_features(array, number, rng, jobs, settings.moving_ego))
     return partial(table_and_beside, real, open_field, domain)
 
 
 def fit_of(windows_of: WindowsOf) -> FitWindows:
-    """Return what makes a window model of some streams."""
-    fitted = lru_cache(maxsize=1)(window_model)  # Of real windows alone it is the same for all streams
+    """Return a function from streams to a window model that is trained on them."""
+    fitted = lru_cache(maxsize=1)(window_model)  # With real windows alone it is the same for all streams
     return lambda some: fitted(*windows_of(some))
 
 
 def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:
-    """Return the windows that may be learned, as windows of this array; those of another one are refused."""
+    """Return the windows that may be learned, in the domain of this array; another array is an error."""
     kept = table.select(~np.isin(table.environments, settings.leave_out))
     if kept.domain is None:
         return replace(kept, domain=domain)
@@ -432,15 +432,15 @@ def table_and_beside(
     domain: ModelDomain,
     streams: Sequence[HeardStream],
 ) -> tuple[FeatureTable, SimulatedWindows | None]:
-    """Return the windows that a model is trained on, and what it learns beside them, if anything."""
-    # At real junctions of a moving ego left out the AUROC is .86 of real windows alone, .84 with those of
-    # drives beside, .69 with sources in the open as well.
+    """Return the windows that a model is trained on, and additional simulated windows, if any."""
+    # At left-out real junctions of a moving ego, the AUROC is 0.86 with real windows alone, 0.84 with added
+    # windows of drives, and 0.69 with added sources in the open as well.
     if real is not None and domain.ego_motion == "moving":
         return real, None
     learned = learned_beside(streams, open_field)
     if real is not None:
         return real, learned.beside(real.environments)
-    # Without real windows the streams' own take their place; classes that these do not know stay beside.
+    # Without real windows, windows of the streams with the usual classes replace them; the others are added.
     own = np.isin(learned.y, CLASSES)
     n_features = learned.X.shape[1] // (1 + len(KINDS))
     numbers = np.arange(len(own)).astype(np.str_)[own]
@@ -466,7 +466,7 @@ def exam_of(
     jobs: int = 1,
     on_step: Callable[[float], None] = lambda minutes: None,
 ) -> list[ExaminedStream]:
-    """Let a model hear streams of the five junctions with a name, which it has not learned."""
+    """Examine a model on streams of the five named junctions, which it was not trained on."""
     plan, arrays, examined = exam_streams(settings), [array, *beside], list[ExaminedStream]()
     folder.mkdir(parents=True, exist_ok=True)
     hear = partial(_heard_and_examined, model, arrays, folder)
@@ -484,10 +484,10 @@ def _heard_and_examined(
 
 
 def examine_stream(model: Model, heard: HeardStream) -> ExaminedStream:
-    """Let a model with an alarm examine a stream that was listened to."""
+    """Examine a model with an alarm on a processed stream."""
     windows, sequence = parts_of(model)
     if sequence.alarm is None:
-        raise InvalidArgumentError("model: expected one with an alarm, as `commission` makes")
+        raise InvalidArgumentError("model: expected a model with an alarm, as from `commission`")
     evidence = stream_evidence(windows, heard)
     told = advised(stream_states(heard, windows, sequence, evidence, model.guard, model.street))
     return ExaminedStream(heard, stream_truth(heard), sequence.posterior(evidence), told)
@@ -496,7 +496,7 @@ def examine_stream(model: Model, heard: HeardStream) -> ExaminedStream:
 def exam_of_mountings(
     array: MicrophoneArray, model: Model, settings: CommissionSettings, folder: Path, jobs: int = 1
 ) -> Iterator[dict[str, ExaminedStream]]:
-    """Let a model hear each stream of a junction as it would believe every wrong mounting of its array."""
+    """Examine a model on each stream of a junction, processed with every wrong mounting of its array."""
     mounted = mountings(array, np.random.default_rng(settings.seed))
     hear = partial(_heard, [array], [list(mounted.values())], folder)
     for heard in in_processes(hear, mounting_streams(settings), jobs):

@@ -1,7 +1,7 @@
-"""Train a domain guard on what one microphone hears: streets against foreign sounds and warning signals.
+"""Train a domain guard on the sound of one microphone: streets against foreign sounds and warning signals.
 
-The street is heard at junctions and as close passes by other recorders: a guard of streets alone took three
-quarters of real passing cars for foreign.
+Street sounds are recorded at junctions and, as close passes, by other recorders. A guard trained on junctions
+alone took three quarters of real passing cars for foreign.
 """
 
 from collections.abc import Sequence
@@ -40,8 +40,7 @@ from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from .heard_stream import HeardStream, junction_named
 from .simulated_windows import hop_labels
 
-# What the guard says of the simulator's kinds. Gusts blow at microphones that it does not hear: the monitor
-# of the channels finds them.
+# Classes of the guard for the simulator's kinds. Gusts are missing: the channel monitor detects them.
 FOREIGN = {
     **{"voice": "speech", "children": "speech", "music": "music", "tune": "music", "drums": "music"},
     **{"tone": "tones", "steps": "steps", "bell": "bells", "saw": "tools", "drill": "tools"},
@@ -52,33 +51,33 @@ SIGNALS = {
     **{"horn": "horn", "horns": "horn"},
     **{"beeper": "reversing beeper", "bicycle-bell": "bicycle bell"},
 }
-CLOSE = "close"  # What passes or idles some metres away, at no junction
-OF_STREETS = ("none", "front", "hidden")  # Hops at junctions, which set the threshold
+CLOSE = "close"  # Vehicles that pass or idle some metres away, at no junction
+OF_STREETS = ("none", "front", "hidden")  # Hops at junctions, which determine the threshold
 STREET = (*OF_STREETS, CLOSE)
-# Recorded where little else is heard.
+# Kinds that are recorded in quiet places.
 CALM = ("horn", "horns", "dog", "shots", "steps", "bell", "bicycle-bell", "drums", "drill", "saw")
 IDLING = ("light", "medium", "heavy", "motorcycle")
 CLIP_S = (3.0, 6.0)
-_IN_TRAFFIC, _OVER_TRAFFIC_DB = 0.8, (-15.0, 20.0)  # A warning signal sounds where vehicles are
-PLACES = 4  # Folds of what is heard close
-CLIPS_EACH = 40  # With thirty, shares of real clips move by .05 from draw to draw
+_IN_TRAFFIC, _OVER_TRAFFIC_DB = 0.8, (-15.0, 20.0)  # A warning signal sounds among vehicles
+PLACES = 4  # Folds of close sounds
+CLIPS_EACH = 40  # With 30, shares of real clips differ by 0.05 between draws
 SOUND_S = 20.0
-# Over the ambience, in the band that the guard hears, over the louder half of the sound: a pause is none.
+# Ratio to the ambience in the guard's band, over the louder half of the sound, which excludes pauses.
 SNR_DB, AUDIBLE_DB = (0.0, 25.0), 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundRows:
-    """Hops with what one microphone heard until then."""
+    """Hops with the measures of the sound before them at one microphone."""
 
     measures: FloatArray  # shape (n, MEASURES), or (n, MEASURES and BANDS) of road users
-    # shape (n,): The simulator's; of a guard one of STREET, FOREIGN, SIGNALS, empty where it is in between
+    # shape (n,): Kinds of the simulator; for a guard one of STREET, FOREIGN, SIGNALS, or empty
     kinds: TextArray
     sites: TextArray  # shape (n,)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the rows of all."""
+        """Return the rows of all parts."""
         return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
     def select(self, keep: BoolArray) -> Self:
@@ -93,10 +92,10 @@ def fit_softmax(
     weights: FloatArray,
     strength: float = 0.03,
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit slopes, shape (classes, m), and biases of raw inputs to weighted rows.
+    """Fit slopes, shape (classes, m), and biases for raw inputs to weighted rows.
 
-    Shapes: inputs (n, m), classes, standardised_by, weights (n,). `strength` is scikit-learn's C at weights
-    of mean one.
+    Shapes: inputs (n, m), classes, standardised_by, weights (n,). `strength` is scikit-learn's C for weights
+    with a mean of one.
     """
     mean, scale = standardisation(inputs, standardised_by)
     fitted = optional("sklearn.linear_model").LogisticRegression(C=strength, max_iter=300, tol=1e-3)
@@ -108,7 +107,7 @@ def fit_softmax(
 def sound_rows(
     array: MicrophoneArray, site_name: str, sample_rate_hz: float, rng: np.random.Generator
 ) -> SoundRows:
-    """Render a sound of every kind at a site, as the middle microphone hears it; return its audible hops."""
+    """Render a sound of every kind at a site, at the middle microphone; return its audible hops."""
     settings = StreamSettings(junction_named(site_name), minutes=1.0, sample_rate_hz=sample_rate_hz)
     position = standing_m(array)[array.middle]
     kinds = (*FOREIGN, *SIGNALS)
@@ -121,11 +120,11 @@ def sound_rows(
 
 
 def street_rows(stream: HeardStream) -> SoundRows:
-    """Return every hop of a stream that was listened to; no label where other sounds are heard."""
+    """Return every hop of a processed stream; hops have no label if other sounds are present."""
     measures, usable = heard_characters(stream)
     labels = hop_labels(stream)
-    # What sounds there may well be foreign. It is learned as what streets hold, but no threshold is set on
-    # it: with it the threshold that .025 of streets exceed rose from -1 to 2.8 nats.
+    # Sounds there may be foreign. They are learned as part of streets but do not affect the threshold: with
+    # them, the threshold that 2.5 % of street hops exceed rose from -1 to 2.8 nats.
     if traffic_named(str(stream.hops.about["traffic"])).sounds:
         labels = np.full_like(labels, "")
     kinds = np.where(np.isin(labels, ("left", "right", "both")), "hidden", labels)[usable]
@@ -135,12 +134,12 @@ def street_rows(stream: HeardStream) -> SoundRows:
 def close_rows(
     sample_rate_hz: float, rng: np.random.Generator, each: int = CLIPS_EACH, jobs: int = 1
 ) -> SoundRows:
-    """Render so many clips of every kind of vehicle and of sound some metres away; kinds are the simulator's.
+    """Render clips of every kind of vehicle and sound some metres away; kinds are the simulator's.
 
-    As in a clip, what is heard begins with its first hop.
+    As in a real clip, the sound begins with its first hop.
     """
-    # Rain falls on the microphones and stands nowhere: it is heard at the sites.
-    # Motorcycles differ more than cars do.
+    # Rain falls on the microphones and has no position, so it is rendered at the sites. Motorcycles are drawn
+    # twice, because they differ more than cars.
     vehicles = [*KINDS, "motorcycle", *(f"idling {name}" for name in IDLING)]
     names = [*vehicles, *vehicles, *FOREIGN, *SIGNALS]
     plan = [(name, number) for name in names if name != "rain" for number in range(each)]
@@ -149,7 +148,7 @@ def close_rows(
 
 
 def rows_of_clip(rate_hz: float, drawn: tuple[str, int, np.random.Generator]) -> SoundRows:
-    """Render one clip: a kind of the simulator or "idling" and a vehicle, its number, randomness."""
+    """Render one clip from its kind (or "idling" and a vehicle), its number and its generator."""
     name, number, rng = drawn
     kind, seconds = name.removeprefix("idling "), rng.uniform(*CLIP_S)
     if kind in KINDS:
@@ -197,7 +196,7 @@ def event_and_ambience(
     rng: np.random.Generator,
     lead_s: float = 0.0,
 ) -> tuple[Float32Array, Float32Array]:
-    """Return an event alone and the ambience alone, which leads it, shape (samples,), of full scale 1."""
+    """Return an event alone, and the ambience alone with a lead time, shape (samples,), full scale 1."""
     alone = Microphones(position_m[None], np.zeros(1), np.ones(1), settings.sample_rate_hz)
     with one_blas_thread():
         sound = event_sound(event, settings.site, settings.preset, alone, rng).pressure_pa
@@ -205,7 +204,7 @@ def event_and_ambience(
         samples = sound.shape[1] + round(lead_s * alone.sample_rate_hz)
         ambience = ambience_piece(scene, samples, rng, begins=True)[0, :samples]
         if not settings.ego.stands:
-            # Driving all the time: what stands is learned from the end of the drives.
+            # The ego drives all the time; the ends of the drives show an ego at rest.
             speed = np.full(samples, rng.uniform(*EGO_SPEEDS_MPS))
             levels = settings.preset.ego_engine_db, settings.site.surface_db
             ambience += ego_noise(position_m[None], speed, alone.sample_rate_hz, rng, *levels)[:, 0]
@@ -214,7 +213,7 @@ def event_and_ambience(
 
 
 def characters(sound: AnyArray, sample_rate_hz: float) -> tuple[FloatArray, BoolArray]:
-    """Return `MEASURES` and `BANDS` of every hop that has any, shape (n, 49), and which these are."""
+    """Return `MEASURES` and `BANDS` of every hop that has them, shape (n, 49), and which hops these are."""
     character, length = SoundCharacter(sample_rate_hz), round(sample_rate_hz / HOPS_A_SECOND)
     read = []
     for hop in sound[: len(sound) // length * length].reshape(-1, length):
@@ -226,32 +225,32 @@ def characters(sound: AnyArray, sample_rate_hz: float) -> tuple[FloatArray, Bool
 
 
 def heard_characters(stream: HeardStream) -> tuple[FloatArray, BoolArray]:
-    """Return the `characters` of a stream that was listened to."""
+    """Return the `characters` of a processed stream."""
     middle = stream.hops.middle / np.float32(np.iinfo(np.int16).max)
     return characters(middle.ravel(), float(middle.shape[1] * HOPS_A_SECOND))
 
 
 def loudness(sound: Float32Array, sample_rate_hz: float) -> FloatArray:
-    """Mean square of every hop in the band that the guard hears, shape (hops,)."""
+    """Return the mean square of every hop in the guard's band, shape (hops,)."""
     band = scipy.signal.butter(4, BAND_HZ, "bandpass", fs=sample_rate_hz, output="sos")
     length = round(sample_rate_hz / HOPS_A_SECOND)
     heard = scipy.signal.sosfilt(band, sound)[: len(sound) // length * length]
     return np.asarray(np.square(heard).reshape(-1, length).mean(axis=1))
 
 
-FLAGGED = 0.025  # Share of the hops of each label of streets never heard that may be flagged
-# Of the weight of all rows; within each the classes, and within a class the kinds, weigh the same, however
-# long they were heard. Of the street half is heard at junctions and half close by.
+FLAGGED = 0.025  # Share of hops of each label that may be flagged, on streets outside the training
+# Shares of the total weight. All classes of a group, and all kinds of a class, have equal weight for any
+# duration of sound. Of the street weight, half is for junctions and half for close sound.
 _STREET, _FOREIGN, _SIGNALS = 0.5, 0.3, 0.2
-_FOLDS, _SITES_OF_SOUNDS = 5, 8  # More of either cost minutes
-_EVERY = 8  # Neighbouring hops share nineteen twentieths of their sound
-_FIGURES = 5  # Of a coefficient in the file, which is a fifth as long
-# The least threshold, in quarters of a nat, that no more than .05 of the hops of 195 CC0 recordings of buses
-# and trams exceed by guards that never heard their recordist (.057 at .5, .046 at .75); that of streets lies
-# below it.
+_FOLDS, _SITES_OF_SOUNDS = 5, 8  # Larger values of either take minutes
+_EVERY = 8  # Neighbouring hops share 95 % of their sound
+_FIGURES = 5  # Significant figures of coefficients, which make the file a fifth as long
+# The least threshold, in quarters of a nat, that at most 5 % of the hops of 195 CC0 recordings of buses and
+# trams exceed (5.7 % at 0.5, 4.6 % at 0.75), with guards that were not trained on the recordist. The
+# threshold from streets is lower.
 CC0_THRESHOLD = 0.75
-# Log-odds of a signal over all that is foreign that .975 of the hops of simulated signals exceed, by guards
-# that never heard the place or the clip (-3.85).
+# Log-odds of a signal over all foreign sound that 97.5 % of the hops of simulated signals exceed (-3.85),
+# with guards that were not trained on the place or the clip.
 SIGNAL_NATS = -4.0
 CHOSEN_FOR_GUARD = (
     f"guard's least threshold {CC0_THRESHOLD} chosen on 195 CC0 recordings of buses and trams, its signals at"
@@ -266,7 +265,7 @@ def guard_rows(
     sounds_each: int = 1,
     jobs: int = 1,
 ) -> SoundRows:
-    """Return the rows of streets, and those of so many sounds of each kind at some of their sites."""
+    """Return the rows of streets, and those of some sounds of each kind at some of their sites."""
     rate_hz = float(streets[0].hops.middle.shape[1] * HOPS_A_SECOND)
     sites = sorted({stream.site for stream in streets})[:_SITES_OF_SOUNDS] * sounds_each
     draws = list(zip(sites, rng.spawn(len(sites)), strict=True))
@@ -286,7 +285,7 @@ def train_guard(
     rng: np.random.Generator,
     jobs: int = 1,
 ) -> DomainGuard:
-    """Train a guard on streets that were listened to, of two sites at least, and on sounds."""
+    """Train a guard on processed streams of at least two sites, and on sounds."""
     rows = SoundRows.joined([guard_rows(array, streets, rng, jobs=jobs), of_guard(close)])
     excesses = street_excesses(rows)
     found = [excesses[label][~np.isnan(excesses[label])] for label in OF_STREETS]
@@ -294,19 +293,19 @@ def train_guard(
 
 
 def of_guard(close: SoundRows) -> SoundRows:
-    """Return the rows of what is heard close by as a guard takes them: any vehicle is the street."""
+    """Return close sounds as rows for a guard: any vehicle belongs to the street."""
     kinds = np.where(np.isin(close.kinds, list(KINDS)), CLOSE, close.kinds)
     return replace(close, measures=close.measures[:, : len(MEASURES)], kinds=kinds)
 
 
 def threshold_of(excesses: Sequence[FloatArray]) -> float:
-    """Return the log-odds that no more than `FLAGGED` of the hops of any label exceed."""
+    """Return the log-odds that at most `FLAGGED` of the hops of any label exceed."""
     held = (float(np.quantile(excess, 1.0 - FLAGGED)) for excess in excesses if len(excess))
     return max(held, default=-np.inf)
 
 
 def street_excesses(rows: SoundRows) -> dict[str, FloatArray]:
-    """Return the log-odds of the hops of streets, by label, from guards that never heard their site."""
+    """Return the log-odds of street hops by label, from guards that were not trained on their site."""
     held_out: dict[str, list[FloatArray]] = {label: [] for label in STREET}
     names = np.unique(rows.sites)
     for fold in range(min(_FOLDS, len(names))):
@@ -318,9 +317,9 @@ def street_excesses(rows: SoundRows) -> dict[str, FloatArray]:
 
 
 def fit_guard(rows: SoundRows, threshold: float = 0.0) -> DomainGuard:
-    """Fit the coefficients of a guard to all rows, with a threshold from elsewhere.
+    """Fit the coefficients of a guard to all rows, with a given threshold.
 
-    A kind that the simulator does not have is a foreign sound of its own.
+    A kind that the simulator does not have becomes a foreign class of its own.
     """
     names = {**dict.fromkeys((*STREET, ""), "street"), **FOREIGN, **SIGNALS}
     others = {kind: kind for kind in np.unique(rows.kinds).tolist() if kind not in names}
@@ -349,7 +348,7 @@ def _named(rows: SoundRows, names: dict[str, str]) -> tuple[str, ...]:
 
 
 def _weights(kinds: TextArray, labels: IndexArray, foreign: int, signals: int) -> FloatArray:
-    """Return weights of sum 1, shape (n,): the same for every class of a group and every kind of a class."""
+    """Return weights with sum 1, shape (n,), equal for all classes of a group and all kinds of a class."""
     shares = [_STREET, *[_FOREIGN / foreign] * foreign, *[_SIGNALS / signals] * signals]
     weights = np.zeros(len(labels))
     for label, share in enumerate(shares):

@@ -1,6 +1,6 @@
-"""Which streams a model for an array is learned from and examined on, and what the front-end hears of them.
+"""Streams for training and exam of a model for an array, and the front-end's output for them.
 
-The sound itself is not kept: an hour of 56 channels at 6 kHz is 5 GB, what is heard in it 50 MB.
+The sound itself is not stored: an hour of 56 channels at 6 kHz takes 5 GB, the output 50 MB.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -40,50 +40,50 @@ from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.truth import VehicleTruth
 from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
-# Hazards one after another; a moving ego has one a drive, with the arrivals that its model learned.
+# Names of traffic: hazards one after another, one hazard per drive of a moving ego, and none.
 PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
-# What a standing ego's model learns in streets of each renderer, in weather that varies: at every junction
-# vehicles that come, and at two of four what is near or loud and never comes.
+# Training traffic for an ego at rest, with each renderer and in varied weather: vehicles that come at every
+# junction, and at two of four junctions near or loud sources that never come.
 TOWN, CALM_TOWN, MISLEADING_TOWN = "town-varied", "no-hazard-varied", "misleading-varied"
 LEARNED_PRESET = "street-7"
-# Beside it, half as long, the usual preset without weather: models of one of the two lose in the other.
+# In addition, half as long, the usual preset without weather: a model of one preset is worse on the other.
 USUAL_SHARE = 0.5
-RENDERERS = {"S": 0, "T": 500, "M": 750}  # First letter of a junction's name, and where its numbers begin
-EXAM_OTHERS = ("A911", "B911", "A912", "B912", "A913")  # Junctions of the other renderers that examine
-# Seeds of streams that are learned from and of those that examine; neither is ever the other. Every
-# junction has its own: of one seed the same drivers come at the same times everywhere.
+RENDERERS = {"S": 0, "T": 500, "M": 750}  # First letter of a junction's name, and its first number
+EXAM_OTHERS = ("A911", "B911", "A912", "B912", "A913")  # Exam junctions of the other renderers
+# Seeds of training streams and exam streams, which never overlap. Every junction has its own; with one seed
+# the same drivers would come at the same times everywhere.
 LEARNED_SEED, USUAL_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 1_099_000, 2_000_000, 1000
-# Of a moving ego a stream is many drives, each with a seed of its own. An approach is judged to six seconds
-# after its last vehicle, and a second one of a queue comes four seconds after the first.
+# With a moving ego, a stream is many drives with a seed each. An approach is judged until six seconds after
+# its last vehicle, and a second vehicle of a queue comes four seconds after the first.
 DRIVES_S, DRIVES_EACH = {APPROACHES: 18.0, HAZARD_FREE: 12.0}, 1000
-MOUNTING = 2  # Number of the junction where wrong mountings are heard
+MOUNTING = 2  # Number of the junction for wrong mountings
 
 
 @dataclass(frozen=True, slots=True)
 class CommissionSettings:
-    """How much is simulated, and what alarms are allowed.
+    """Amount of simulation, and the allowed alarms.
 
     Parameters
     ----------
     junctions : int
-        Drawn junctions of each renderer to learn from, half with a wall across the crossing street; with few,
-        a model learns these streets instead of streets.
+        Drawn junctions per renderer for training, half of them with a wall across the crossing street. With
+        few junctions a model learns these streets instead of streets in general.
     approach_minutes, hazard_free_minutes : float
-        Stream at each of them; of an ego that stands half as much again in streets without weather.
+        Length of the stream at each junction; an ego at rest adds half as much in streets without weather.
     exam_minutes : float
-        Hazard-free stream at each junction of the exam; approaches take three fifths of that.
+        Length of the hazard-free stream per exam junction; the stream with approaches has three fifths of it.
     onsets_per_hour : float
-        Alarms allowed where no vehicle comes.
+        Alarms allowed per hour without vehicles.
     bandwidth_hz : float
-        Sound is rendered up to here.
+        Upper limit of the rendered frequencies.
     seed : int
-        Another seed, other streams.
+        Seed of the random streams.
     moving_ego : bool
-        Whether the ego drives up to the corner, in many drives a junction, or stands there.
+        Whether the ego drives up to the corner, in many drives per junction, or stands there.
     leave_out : tuple of str
-        Real junctions whose labelled windows are not learned.
+        Real junctions whose labelled windows are not used for training.
     quick : bool
-        Whether this is to try the command: what comes out is marked as unfit for use.
+        Whether this only tests the command; the model is then marked as unfit for use.
 
     Examples
     --------
@@ -105,27 +105,27 @@ class CommissionSettings:
 
     @property
     def sites(self) -> tuple[str, ...]:
-        """The junctions with a name, which examine."""
+        """The named junctions, which are used for the exam."""
         return MOVING_SITES if self.moving_ego else SITES
 
     def __post_init__(self) -> None:
         check_ranges(self, junctions=(2, 200))
-        # Of less there are streams without vehicles, and nothing is learned.
+        # Shorter streams contain no vehicles, and nothing can be learned.
         check_ranges(self, approach_minutes=(0.9, 120.0), hazard_free_minutes=(0.5, 120.0))
         check_ranges(self, exam_minutes=(0.5, 160.0), onsets_per_hour=(0.1, 3600.0), seed=(0, SEEDS_EACH - 1))
 
 
 def quick_settings(settings: CommissionSettings) -> CommissionSettings:
-    """Return settings under which two junctions of a minute each are all that is learned."""
+    """Return settings for training at two junctions with about a minute each."""
     return replace(
         settings, junctions=2, approach_minutes=1.2, hazard_free_minutes=0.5, exam_minutes=2.0, quick=True
     )
 
 
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
-    """Return the streams that a model learns from: drawn junctions, none of the five with a name.
+    """Return the training streams: drawn junctions, none of the five named ones.
 
-    As many of each renderer, none of which outweighs the others.
+    All renderers have the same number, so that none outweighs the others.
     """
     plans = {i: f"{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
     approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
@@ -133,7 +133,7 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     for letter, (i, plan) in product(RENDERERS, plans.items()):
         name = _numbered(letter, {i: plan}, settings)
         if settings.moving_ego:
-            # The noise of a moving ego was set beside the levels of the preset that is usual.
+            # The noise of a moving ego was set relative to the levels of the usual preset.
             found += _streams(name, LEARNED_SEED, {APPROACHES: approaching, HAZARD_FREE: quiet}, settings)
             continue
         without = MISLEADING_TOWN if i % 4 < 2 else CALM_TOWN
@@ -145,15 +145,15 @@ def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
 
 
 def _numbered(letter: str, plans: Mapping[int, str], settings: CommissionSettings) -> dict[int, str]:
-    """Return the junctions of a renderer, by numbers of its own."""
+    """Return the junctions of a renderer, with numbers of its own."""
     prefix = "D" + letter.removeprefix("S") if settings.moving_ego else letter
     return {RENDERERS[letter] + i: prefix + plan for i, plan in plans.items()}
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
-    """Return the streams of an exam: the five junctions with a name, twenty singles of each and more.
+    """Return the exam streams: twenty single vehicles and more at each of the five named junctions.
 
-    Five junctions of each of the other renderers too, of an ego that stands for a third of the time.
+    Five junctions of each other renderer are added, with a third of the time for an ego at rest.
     """
     names = {i: name for i, name in enumerate(settings.sites) if i == MOUNTING or not settings.quick}
     hazards = APPROACHES if settings.moving_ego else PAIRS
@@ -167,19 +167,19 @@ def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
 
 
 def mounting_streams(settings: CommissionSettings) -> list[StreamSettings]:
-    """Return the streams of the exam at the junction where wrong mountings are heard, too."""
+    """Return the exam streams at the junction for wrong mountings."""
     return [one for one in exam_streams(settings) if one.site.name == settings.sites[MOUNTING]]
 
 
 def junction_named(name: str) -> Site:
-    """Return one of the five junctions, or the drawn one of another name."""
+    """Return a named junction, or the drawn junction of another name."""
     return site(name) if name in SITES + MOVING_SITES else drawn_site(name)
 
 
 def _streams(
     names: Mapping[int, str], first_seed: int, minutes_of: Mapping[str, float], settings: CommissionSettings
 ) -> list[StreamSettings]:
-    """Return a stream of each traffic at every numbered junction, or as many drives as last so long."""
+    """Return a stream of each traffic at every numbered junction, or as many drives as fill its time."""
     found: list[StreamSettings] = []
     for (number, name), (traffic, minutes) in product(names.items(), minutes_of.items()):
         own = first_seed + number + SEEDS_EACH * settings.seed
@@ -195,12 +195,12 @@ def _streams(
     return found
 
 
-# What a bracket and a tape measure leave: two degrees are 14 mm over the width of 40 cm.
+# Errors that a bracket and a tape measure leave: two degrees are 14 mm over a width of 40 cm.
 YAW_DEG, POSITION_MM = 2.0, 5.0
 
 
 def mountings(array: MicrophoneArray, rng: np.random.Generator) -> dict[str, MicrophoneArray]:
-    """Return what an array may be believed to be: itself, turned, or with every coordinate a little off.
+    """Return versions of an array: as mounted, turned, and with a small error in every coordinate.
 
     Examples
     --------
@@ -225,20 +225,20 @@ _PCM = 32767.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeardStream:
-    """What was heard of one stream, and the vehicles there."""
+    """Output of the front-end for one stream, and the vehicles in the stream."""
 
-    hops: HopTable  # One row a hop: `AcousticFrame` by columns, NaN where something was refused
-    vehicles: HopTable  # One row a vehicle: flow, kind, arm, T0 as `entry_s` (NaN: never comes into view)
-    rows: HopTable  # One row a vehicle and .1 s: time, place, in view, how loud, in `BAND_HZ` too
+    hops: HopTable  # One row per hop: columns of `AcousticFrame`, NaN for missing values
+    vehicles: HopTable  # One row per vehicle: flow, kind, arm, T0 as `entry_s` (NaN: never comes into view)
+    rows: HopTable  # One row per vehicle and 0.1 s: time, position, in view, loudness, also in `BAND_HZ`
 
     def row_hops(self) -> tuple[IndexArray, BoolArray]:
-        """Return the number of the hop of every row of `rows`, and which of these hops there are."""
+        """Return the hop number of every row of `rows`, and whether that hop exists."""
         time_s = self.hops.time_s
         numbers = np.round((self.rows.time_s - time_s[0]) / ROW_S).astype(np.intp)
         return numbers, (numbers >= 0) & (numbers < len(time_s))
 
     def in_view_within(self, distance_m: float) -> BoolArray:
-        """Tell of every row of `rows` whether the vehicle is in view and no farther away than this."""
+        """Return for every row of `rows` whether the vehicle is in view within a distance."""
         return np.asarray(self.rows.in_view & (np.hypot(self.rows.x_m, self.rows.y_m) <= distance_m))
 
     @property
@@ -253,7 +253,7 @@ class HeardStream:
 
     @property
     def renderer(self) -> str:
-        """What carried its sound, as `Site.renderer` has it; recordings are with the first renderer."""
+        """Renderer of the sound, as in `Site.renderer`; recordings have that of the first renderer."""
         return renderer_named(self.site)
 
     @property
@@ -262,13 +262,13 @@ class HeardStream:
         return ego_moves(self.site)
 
     def save(self, path: Path) -> None:
-        """Write it, whole or not at all."""
+        """Write the stream, completely or not at all."""
         save_named(path, {HOPS: self.hops, VEHICLES: self.vehicles, ROWS: self.rows})
 
     @classmethod
     def load(cls, path: Path) -> "HeardStream":
-        """Read what `save` wrote."""
-        tables = load_named(path, "a stream that was listened to")
+        """Read a stream that `save` wrote."""
+        tables = load_named(path, "a processed stream")
         return cls(tables[HOPS], tables[VEHICLES], tables[ROWS])
 
 
@@ -277,10 +277,10 @@ def hear_stream(
     arrays: Sequence[MicrophoneArray],
     believed: Sequence[Sequence[MicrophoneArray]] = (),
 ) -> list[HeardStream]:
-    """Render a stream once for several arrays and listen to it, block by block, with each of them.
+    """Render a stream once for several arrays, and process it block by block with each of them.
 
-    What an array hears does not depend on the others. `believed` holds for each array what it is believed to
-    be, one stream each; by default itself.
+    Arrays do not affect one another. `believed` contains, for each array, the versions with which its sound
+    is processed, one result each; by default the array itself.
     """
     stream, loudness = draw_stream(settings, *arrays), dict[int, FloatArray]()
     slices = stream.scene.microphones.slices
@@ -305,7 +305,7 @@ def hear_stream(
 
 
 def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
-    """Listen to a recording that is known to hold no vehicle."""
+    """Process a recording that is known to contain no vehicle."""
     with open_sound(sound, array.n_microphones, channels=array.channels) as audio:
         about = {"site": sound.stem, "traffic": "recorded", "sample_rate_hz": audio.sample_rate_hz}
         blocks = audio.blocks(round(audio.sample_rate_hz))
@@ -317,7 +317,7 @@ def hear_recording(sound: Path, array: MicrophoneArray) -> HeardStream:
 def _recorded(
     stream: DrawnStream, blocks: Iterable[Block], loudness_db: dict[int, FloatArray]
 ) -> Iterator[Float32Array]:
-    """Yield what the converters make of the blocks, and keep how loud the events were."""
+    """Yield the blocks as converters record them, and store the loudness of the events."""
     for block in blocks:
         loudness_db |= block.loudness_db
         yield stream.recorded(block)
@@ -352,14 +352,14 @@ def _heard_hops(
 
 
 def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
-    """Return what streams are listened to with: everything that evidence reads, microphones trusted."""
-    # Simulated microphones do not fail, and watching them takes a third of the time.
+    """Return the front-end settings for streams: all evidence, without monitoring of microphones."""
+    # Simulated microphones do not fail, and their monitoring takes a third of the time.
     return FrontEndSettings.heard_at(sample_rate_hz, level_band_hz=LEVEL_BAND_HZ, watch_channels=False)
 
 
 def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.ndarray]:
     looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
-    # The meter belongs to what watches microphones, which is off here; levels alone it reads the same.
+    # The meter is part of the monitoring, which is off here. It needs only levels.
     meter, excess_db = NoiseMeter(), list[float]()
     for one in frames:
         meter.push(one.band_log_energy, float(one.feature.mean()))
@@ -383,15 +383,15 @@ def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.
 
 
 def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
-    """Return what one microphone heard in the last hop of every window, shape (n, samples), 16 bit."""
+    """Return the sound of one microphone in the last hop of every window, shape (n, samples), 16 bit."""
     length = ends[1] - ends[0] if len(ends) > 1 else 0
     pcm = np.round(np.clip(middle, -1.0, 1.0) * _PCM).astype(np.int16)
     return np.array([pcm[end - length : end] for end in ends], np.int16)
 
 
 def _truth(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> tuple[HopTable, HopTable]:
-    """Return one row a vehicle, and one a vehicle and tenth of a second, as in `HeardStream`."""
-    # Typed column by column: of no vehicles at all rows would make columns of floats.
+    """Return one row per vehicle, and one per vehicle and tenth of a second, as in `HeardStream`."""
+    # Typed column by column: without any vehicle, rows would make columns of floats.
     motions = [one.event.manoeuvre for one in every]
     vehicles = HopTable(
         {

@@ -1,4 +1,4 @@
-"""Recordings of a user's own, from which guard and road users are learned beside what is simulated."""
+"""A user's own recordings, for the training of guard and road users together with simulated sounds."""
 
 import hashlib
 from collections import Counter
@@ -18,26 +18,26 @@ from .guard_training import CLOSE, FOREIGN, SIGNALS, SoundRows, characters
 from .road_user_training import CLASS_OF, CLASSES
 
 LOWEST_RATE_HZ, MEMORY_S, MOST_SECONDS = 8000.0, 2.1, 600.0
-# Of every recording, spread over it: as many as a simulated clip has in the mean, so that both count alike.
+# Number per recording, spread over it; an average simulated clip has as many, so both have the same weight.
 HOPS_EACH = 25
-# A kind may be called as guard and road users call it: it is learned as the first such of the simulator's.
+# A kind may be a class name of guard or road users; it then becomes the first simulated kind of that class.
 _AS = {name: kind for kind, name in reversed((FOREIGN | SIGNALS | CLASS_OF).items())}
 _AS |= {"street": CLOSE, "bus": _AS["truck"]}
-_FREE = "Creative Commons 0"  # Whatever is learned from it is free, too
+_FREE = "Creative Commons 0"  # Everything that is learned from it is free, too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedClips:
-    """What was heard of a table of clips."""
+    """Measures of a table of clips."""
 
-    rows: SoundRows  # Kinds are the simulator's, or those of the table that it has not; sites the recordings
-    recordings: Mapping[str, int]  # How many of each kind, as the table calls it
+    rows: SoundRows  # Kinds of the simulator, or others from the table; sites are the recordings
+    recordings: Mapping[str, int]  # Number of each kind, with its name in the table
     digest: str  # SHA-256 of the table
-    licences: tuple[str, ...]  # As the table states them
+    licences: tuple[str, ...]  # As stated in the table
 
     @property
     def told(self) -> str:
-        """For the provenance of what was learned from them."""
+        """Description for the provenance of a model trained on the clips."""
         kinds = ", ".join(f"{kind} {number}" for kind, number in self.recordings.items())
         of = f"{kinds}; {', '.join(self.licences)}; table of SHA-256 {self.digest}"
         owned = "" if self.licences == (_FREE,) else ": these coefficients are not the project's own"
@@ -46,16 +46,16 @@ class RecordedClips:
 
 
 def read_recorded(folder: Path, table: Path, advance: Callable[[], object] = lambda: None) -> RecordedClips:
-    """Hear the clips of a table, whose files lie in a folder; `advance` is called after every line.
+    """Process the clips of a table with files in a folder; `advance` is called after every line.
 
-    Columns are file, kind and, if it has them, recording (each file is one without), road_user (a class of
-    `CLASSES`, empty if it is none) and licence. A kind that neither the simulator nor the guard names is a
-    foreign sound of its own; a bus is a truck.
+    The columns are file and kind, and optionally recording (default: one per file), road_user (a class of
+    `CLASSES`, or empty) and licence. A kind that is unknown to the simulator and the guard becomes a foreign
+    class of its own; a bus is a truck.
 
     Raises
     ------
     InputFileError
-        If the table or a file cannot be read, or a line names no kind or an unknown road user.
+        If the table or a file cannot be read, or a line has no kind or an unknown road user.
     """
     heard: dict[tuple[str, str], list[FloatArray]] = {}
     licences = dict[str, None]()
@@ -82,7 +82,7 @@ def _rows(kind: str, recording: str, measures: FloatArray) -> SoundRows:
 def heard_clip(path: Path) -> FloatArray:
     """Return the `characters` of the first channel of a file, shape (n, 49).
 
-    A clip shorter than the memory of the numbers is led in by its mirror image.
+    A clip that is shorter than the memory of the measures is preceded by its mirror image.
     """
     with open_audio(path) as source:
         rate = float(source.sample_rate_hz)

@@ -1,7 +1,7 @@
-"""Train what tells kinds of road users apart: each kind passes alone, and one microphone hears it.
+"""Train the classifier of road users: each kind passes alone, at one microphone.
 
-Streams of a town hardly hold a tram or a motorcycle, and two vehicles at once have no class. Every kind comes
-out of the left arm of every junction instead, over the ambience of the place.
+Town streams contain hardly any trams or motorcycles, and two vehicles at once have no class. Instead, every
+kind comes out of the left arm of every junction, over the ambience of the place.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,35 +27,35 @@ from worldstate.simulation.stream.truth import visible_s
 from .guard_training import SoundRows, characters, event_and_ambience, fit_softmax, loudness
 from .heard_stream import junction_named
 
-# What the simulator's kinds are to a user.
+# User classes of the simulator's kinds.
 CLASS_OF = {
     **{"light": "car", "electric": "car", "medium": "van", "heavy": "truck", "tram": "tram"},
     **{"motorcycle": "motorcycle", "bicycle": "bicycle", "scooter": "bicycle"},
 }
-# Assumed, as those of simulated traffic, with some motorcycles and trams beside.
+# Assumed, like those of simulated traffic, with some motorcycles and trams added.
 _SHARES = {
     **{"light": 0.70, "electric": 0.06, "medium": 0.07, "heavy": 0.03, "tram": 0.01},
     **{"motorcycle": 0.02, "bicycle": 0.09, "scooter": 0.02},
 }
 CLASSES = (*dict.fromkeys(CLASS_OF.values()), UNKNOWN)
-# Hops that count in every figure, seconds from line of sight; those before are learned, too.
+# Range of hops in the figures, seconds from line of sight; earlier hops are learned, too.
 FIRST_S, LAST_S = -3.0, 1.5
-_DRIVEN_S, _LEAD_S = 7.0, 3.0  # Before line of sight, and of ambience before that
-# Over the ambience from 250 to 2600 Hz over one second. At 0 dB a seventh of the hops of cars are unknown,
-# though their class is found as well.
+_DRIVEN_S, _LEAD_S = 7.0, 3.0  # Time before line of sight, and of ambience before that
+# Ratio to the ambience, 250 to 2600 Hz, over one second. At 0 dB a seventh of the hops of cars are labelled
+# unknown, although their class is found as well.
 _AUDIBLE_DB = -6.0
-# Chosen on real clips of cars and trams, of which nothing else is learned: their log-loss is .28 at this
-# strength and .40 at .003, that of passes at junctions of both renderers .59 and .55, .86 and .91.
+# Chosen on real clips of cars and trams, which are used for nothing else: their log-loss is 0.28 at this
+# strength and 0.40 at 0.003. For passes at junctions of the two renderers it is 0.59 and 0.55, 0.86 and 0.91.
 STRENGTH = 0.001
-# A recorder that rises or falls over the band shifts the bands along a straight line over octaves. Every row
-# is learned as it is and through two that tilt by so much from end to end, so that a tilt of 6 dB moves no
-# mean probability of a kind by more than .05 (.14 without).
+# A recorder whose response rises or falls over the band shifts the bands along a straight line over octaves.
+# Every row is learned as it is and with two tilts of this size from end to end. A tilt of 6 dB then changes
+# no mean probability of a kind by more than 0.05 (0.14 without).
 _TILT_DB = 21.0
 _OCTAVES = 0.5 * np.log2(np.multiply(EDGES_HZ[:-1], EDGES_HZ[1:]))
 _NATS_OF_TILT = 0.1 * np.log(10.0) * (_OCTAVES - _OCTAVES.mean()) / np.log2(EDGES_HZ[-1] / EDGES_HZ[0])
 CHOSEN_FOR_ROAD_USERS = f"strength {STRENGTH} of road users chosen on 82 passes of cars and trams"
 _FOLDS = 8
-_FIGURES = 5  # Of a coefficient in the file
+_FIGURES = 5  # Significant figures of coefficients
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +73,7 @@ class RoadUserRows(SoundRows):
 
     @property
     def weights(self) -> FloatArray:
-        """What every hop counts so that kinds are as frequent as in a town, of sum 1, shape (n,)."""
+        """Weight of every hop, shape (n,), with sum 1: kinds are as frequent as in a town."""
         near = {kind: int((self.counts & (self.kinds == kind)).sum()) for kind in _SHARES}
         shares = np.array([_SHARES[kind] / max(near[kind], 1) for kind in self.kinds.tolist()])
         return np.asarray(shares * self.counts)
@@ -89,7 +89,7 @@ def road_user_rows(
     jobs: int = 1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> RoadUserRows:
-    """Render so many passes of every kind at every site, as the middle microphone hears them."""
+    """Render passes of every kind at every site, at the middle microphone."""
     position = standing_m(array)[array.middle]
     seeds = rng.integers(2**63, size=(passes, len(sites)))
     plan = [(name, int(seed)) for row in seeds for name, seed in zip(sites, row, strict=True)]
@@ -138,7 +138,7 @@ def _over_a_second(power: FloatArray) -> FloatArray:
 
 
 def with_close(rows: RoadUserRows, close: SoundRows) -> RoadUserRows:
-    """Return the rows with those of vehicles close by, which do not tell how frequent they are."""
+    """Return the rows with those of close vehicles, which have no effect on the frequencies of kinds."""
     vehicles = close.select(np.isin(close.kinds, list(CLASS_OF)))
     number = len(vehicles.kinds)
     heard = (vehicles.measures, vehicles.kinds, vehicles.sites, np.ones(number, np.bool_))
@@ -146,7 +146,7 @@ def with_close(rows: RoadUserRows, close: SoundRows) -> RoadUserRows:
 
 
 def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
-    """Fit a softmax to classes of equal weight, then let them be as frequent as in a town."""
+    """Fit a softmax to classes of equal weight, then set their frequencies to those of a town."""
     tilts = [replace(rows, measures=tilted(rows.measures, tilt_db)) for tilt_db in (-_TILT_DB, _TILT_DB)]
     rows = RoadUserRows.joined([rows, *tilts])
     classes = rows.classes
@@ -159,18 +159,18 @@ def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
 
 
 def tilted(measures: FloatArray, tilt_db: float) -> FloatArray:
-    """Return numbers as heard by a recorder that rises by so much from the lowest band to the highest."""
+    """Return the measures for a recorder whose response rises by this much over all bands."""
     bands = measures[:, len(MEASURES) :] + tilt_db * _NATS_OF_TILT
     return np.column_stack([measures[:, : len(MEASURES)], bands])
 
 
 def town_shares(rows: RoadUserRows) -> FloatArray:
-    """Return how frequent every class is near line of sight in a town, shape (classes,)."""
+    """Return the frequency of every class near line of sight in a town, shape (classes,)."""
     return np.asarray(np.bincount(rows.classes, rows.weights, len(CLASSES)) / rows.weights.sum())
 
 
 def cross_validated(rows: RoadUserRows) -> FloatArray:
-    """Return the probabilities of every hop by a model that never heard its site, shape (n, classes)."""
+    """Return the probabilities of every hop from a model not trained on its site, shape (n, classes)."""
     sites, found = np.unique(rows.sites), np.zeros((len(rows.sites), len(CLASSES)))
     for fold in range(min(_FOLDS, len(sites))):
         here = np.isin(rows.sites, sites[fold::_FOLDS])

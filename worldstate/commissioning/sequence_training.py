@@ -1,4 +1,4 @@
-"""Training of a sequence model on streams: boosted trees from scikit-learn, kept as arrays."""
+"""Training of a sequence model on streams: boosted trees from scikit-learn, stored as arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,12 +22,13 @@ from worldstate.ground.values import significant
 
 from .heard_stream import ROW_S, HeardStream
 
-# Hardly heard before they are seen: as hidden windows they would be wrong labels, as empty ones too.
+# Hardly audible before they are visible: "hidden" and "empty" would both be wrong labels for their windows.
 SILENT_KINDS = ("bicycle", "scooter")
-# Tyres of electric cars are learned from, but heard later than engines: an exam counts all of these apart.
+# Tyres of electric cars are learned, but they are audible later than engines: an exam reports these kinds
+# separately.
 QUIET_KINDS = (*SILENT_KINDS, "electric")
-# Below it a vehicle is lost in the background of a simulated street, some 50 dB at the array; a stream that
-# draws another background has that much more or less.
+# Below this level a vehicle is inaudible in the background of a simulated street, some 50 dB at the array; a
+# stream with another background shifts the level accordingly.
 AUDIBLE_DB = 48.0
 OTHER_SIDE_S = 3.0
 
@@ -36,18 +37,18 @@ OTHER_SIDE_S = 3.0
 class StreamTruth:
     """Vehicles at every hop of a stream; sides are left and right."""
 
-    coming_s: FloatArray  # shape (n, 2): Seconds until the next one comes into view, infinite without
-    seen: BoolArray  # shape (n,): Whether any is in view
-    past_db: FloatArray  # shape (n, 2): Loudest that has left the view into this side
-    far_db: FloatArray  # shape (n, 2): Loudest that never comes into view, or not yet and not from here
-    far_rises: BoolArray  # shape (n, 2): Whether that one grows louder
+    coming_s: FloatArray  # shape (n, 2): Seconds until the next vehicle comes into view, infinite without one
+    seen: BoolArray  # shape (n,): Whether any vehicle is in view
+    past_db: FloatArray  # shape (n, 2): Level of the loudest vehicle that has left the view to this side
+    far_db: FloatArray  # shape (n, 2): Level of the loudest that never comes into view, or has not yet
+    far_rises: BoolArray  # shape (n, 2): Whether that vehicle grows louder
     audible_db: float = AUDIBLE_DB
 
     def groups(self) -> IndexArray:
-        """Return the number of the group of every hop and side, shape (n, 2)."""
+        """Return the group number of every hop and side, shape (n, 2)."""
         nearest = np.searchsorted(COMING_S, self.coming_s, side="left")
         coming = self.coming_s <= COMING_S[-1]
-        # In the order in which they count: a vehicle that comes counts even while another one is in view.
+        # In order of precedence: a vehicle that comes has precedence over one in view.
         conditions = {
             "seen": np.broadcast_to(self.seen[:, None], coming.shape),
             "other": self.coming_s[:, ::-1] <= OTHER_SIDE_S,
@@ -61,7 +62,7 @@ class StreamTruth:
 
 
 def stream_truth(heard: HeardStream) -> StreamTruth:
-    """Collect the rows of all vehicles at the hops of a stream."""
+    """Combine the rows of all vehicles at the hops of a stream."""
     time_s, n = heard.hops.time_s, len(heard.hops)
     coming_s = np.full((n, len(SIDES)), np.inf)
     past_db, far_db = np.full((2, n, len(SIDES)), -np.inf)
@@ -91,21 +92,22 @@ def stream_truth(heard: HeardStream) -> StreamTruth:
     return StreamTruth(coming_s, seen, past_db, far_db, rises, audible_db)
 
 
-# Few and shallow trees of a third of the inputs each: what is deep learns its renderer. Of 324 approaches in
-# streets of the first renderer, which 100 rounds of 4 leaves at a rate of 0.1 did not learn from, they detect
-# 0.70 at 30 onsets an hour; 270 rounds of 16 leaves at 0.2 detect 0.54.
+# Few and shallow trees with a third of the inputs each: deep trees learn their renderer. Of 324 approaches in
+# streets of the first renderer, outside the training, 100 rounds of 4 leaves at a rate of 0.1 detect 70 % at
+# 30 onsets per hour; 270 rounds of 16 leaves at 0.2 detect 54 %.
 RIDGE, INPUTS_EACH = 20.0, 0.3
-# Hops so far apart are learned, in leaves of so many: neighbours share most of their sound, and the time that
-# trees take grows with the rows. Learned of half of ten junctions and judged at the others, both ways, every
-# third, fifth and eighth hop, in leaves as long, have a log-loss of 1.43, 1.40, 1.38 and of 1.60, 1.57, 1.59.
+# Interval of the learned hops, and least number of hops in a leaf. Neighbours share most of their sound, and
+# the training time grows with the rows. Trained on half of ten junctions and tested on the others, both ways,
+# the log-loss with every third, fifth and eighth hop, and leaves of the same duration, is 1.43, 1.40, 1.38
+# and 1.60, 1.57, 1.59.
 EVERY_HOPS, SMALLEST_LEAF = 5, 180
 COVERAGE = 0.9
-_FIGURES = 7  # Of a number in the file: it is half as long, and no input is known better
+_FIGURES = 7  # Significant figures, which halve the length of the file; no input is more precise
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """How many trees are grown a group, how large, and how much each of them counts."""
+    """Number of trees per group, their size, and their learning rate."""
 
     rounds: int
     leaves: int
@@ -119,11 +121,11 @@ MOVING = (Growth(120, 8, 0.2),)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledStream:
-    """Hops of one stream to learn from, by a window model that did not learn from it."""
+    """Training hops of one stream, with evidence from a window model not trained on this stream."""
 
     inputs: FloatArray  # shape (n, 2, inputs)
     groups: IndexArray  # shape (n, 2)
-    weight: float = 1.0  # Of each of its hops
+    weight: float = 1.0  # Weight of each hop
 
     @classmethod
     def of(cls, inputs: FloatArray, truth: StreamTruth, weight: float = 1.0) -> "LabelledStream":
@@ -137,13 +139,13 @@ def train_sequence(
     sizes: Sequence[Growth] = STANDING,
     threads: int | None = None,
 ) -> SequenceModel:
-    """Train on the hops of streams, each weighted so that hazards are as frequent as in use."""
+    """Train on the hops of streams, weighted so that hazards are as frequent as in use."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
     inputs = np.concatenate([one.inputs.reshape(-1, one.inputs.shape[-1]) for one in streams])
     groups = np.concatenate([one.groups.reshape(-1) for one in streams])
     weights = np.repeat([one.weight for one in streams], [one.groups.size for one in streams])
-    # Of a few minutes no leaf would have as many hops.
+    # A few minutes have too few hops for such leaves.
     leaf = min(SMALLEST_LEAF, max(len(inputs) // 100, 1))
     machines = [
         HistGradientBoostingClassifier(
@@ -158,7 +160,7 @@ def train_sequence(
         )
         for growth in sizes
     ]
-    # Of processes beside one another each has its core.
+    # Each of several parallel processes has one core.
     with threadpool_limits(threads):
         for machine in machines:
             machine.fit(inputs, groups, sample_weight=weights)
@@ -168,8 +170,8 @@ def train_sequence(
 
 
 def exported(machines: Sequence[Any], check: FloatArray) -> BoostedTrees:
-    """Return the trees of classifiers whose scores are averaged, held against their own on some rows."""
-    # scikit-learn has no public way to its histogram trees: whatever changes there must be noticed here.
+    """Return the trees of classifiers with averaged scores, checked on some rows."""
+    # scikit-learn has no public access to its histogram trees, so a change there must be detected here.
     rounds = [round_ for machine in machines for round_ in machine._predictors]
     found = [(k, one.nodes) for round_ in rounds for k, one in enumerate(round_)]
     classes = machines[0].classes_.astype(np.intp)
@@ -183,19 +185,19 @@ def exported(machines: Sequence[Any], check: FloatArray) -> BoostedTrees:
         split[row, at], threshold[row, at] = nodes["feature_idx"][at], nodes["num_threshold"][at]
         yes[row, at], no[row, at] = nodes["left"][at], nodes["right"][at]
         value[row, : len(nodes)] = np.where(inner, 0.0, nodes["value"] / len(machines))
-    # Groups that no hop belonged to keep no chance.
+    # Groups without hops get a probability near zero.
     baseline = np.full(len(GROUPS), -30.0)
     baseline[classes] = np.mean([np.ravel(one._baseline_prediction) for one in machines], axis=0)
     trees = BoostedTrees(split, threshold, yes, no, value, classes[[k for k, _ in found]], baseline)
     own = np.mean([one.decision_function(check) for one in machines], axis=0)
     if not np.allclose(trees.scores(check)[:, classes], own, atol=1e-6):
-        raise WorldstateError("scikit-learn keeps its trees in another way than 1.5 to 1.9 did: not exported")
+        raise WorldstateError("trees not exported: this scikit-learn stores them differently from 1.5 to 1.9")
     threshold, value = (significant(one, _FIGURES) for one in (trees.threshold, trees.value))
     return replace(trees, threshold=threshold, value=value)
 
 
 def calibrated_margin_s(said: Sequence[tuple[SequencePosterior, StreamTruth]]) -> float:
-    """Return what the interval of the time to visible must be widened by, said of streams not trained on.
+    """Return how far intervals of the time to visible must be widened, from streams outside the training.
 
     Source: Y. Romano, E. Patterson and E. Candes, "Conformalized quantile regression", NeurIPS 2019.
     """

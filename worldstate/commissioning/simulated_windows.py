@@ -1,7 +1,7 @@
-"""Windows cut from streams that were listened to, labelled by the vehicles there, and a window model of them.
+"""Labelled windows from processed streams, and a window model trained on them.
 
-A stream holds what single recordings do not: vehicles from both sides at once, one behind another, and hours
-of distant ones and of those in plain view, which are no hazards.
+Streams contain situations that single recordings lack: vehicles from both sides at once or one behind
+another, and hours of distant vehicles and of vehicles in plain view, which are no hazards.
 """
 
 from collections.abc import Sequence
@@ -40,39 +40,39 @@ from .heard_stream import HeardStream
 from .sequence_training import SILENT_KINDS
 
 UNUSED = ""
-# Hidden: a second or less before it comes into view. Of two, the later one is as loud as that within 2.5 s.
+# Hidden: a second or less before it comes into view. Of two vehicles, the later one is as loud within 2.5 s.
 HIDDEN_S, SECOND_S = 1.0, 2.5
-# Windows of a moving ego lie so much later: its released ones of hidden vehicles end half a second after T0.
+# Windows of a moving ego are later by this: its released hidden windows end half a second after T0.
 MOVING_LATE_S = 0.5
-# In view: from half a second after it came, the released front windows end 1.5 s after; farther than this a
-# vehicle is hardly heard. Windows that hold its sound, to a second after it has gone, are of no other class.
+# In view: from half a second after its arrival (the released front windows end 1.5 s after it). Farther away
+# a vehicle is hardly audible. Its windows, until a second after it has left, have no other class.
 FRONT_S, NEAR_M, WINDOW_S = (0.5, 0.0), 25.0, 1.0
-# Empty: no vehicle comes for so long, nor came in the second before.
+# Empty: no vehicle comes within this time, and none came in the second before.
 CALM_S = 5.0
 
 
-# Windows lie so far apart at least: those of hidden vehicles, which overlap, and all others, which most are.
+# Least distances between windows: of hidden vehicles, which overlap, and of the others, which are most.
 EVERY_S, REST_EVERY_S = 0.5, 10.0
-# Of a hidden window, beside a real one of weight 1; all in view, and all empty, weigh as all hidden. Real and
-# simulated hazards have their sides by other patterns, and this settles between them: at .15, .3, .6 and .9
-# the side is right in .77, .88, .94, .94 of the windows of streams, and in .91, .91, .82, .76 of real ones at
-# junctions left out, AUROC the same. With a quarter of it given to the other side, as windows of simulated
-# recordings have it, .77 and .94 at .3.
+# Weight of a hidden window relative to a real one; all windows in view, and all empty ones, weigh as much as
+# all hidden ones. The sides of real and simulated hazards have different patterns, and this weight is a
+# compromise: at 0.15, 0.3, 0.6 and 0.9 the side is right in 77, 88, 94 and 94 % of the windows of streams,
+# and in 91, 91, 82 and 76 % of real windows at left-out junctions, with the same AUROC. If a quarter of it
+# goes to the other side, as in windows of simulated recordings, it is 77 and 94 % at 0.3.
 WEIGHT = 0.3
 
 
 def hop_labels(stream: HeardStream) -> TextArray:
-    """Return the class of the second that ends at each hop, shape (n,); empty where it is in between."""
+    """Return the class of the second before each hop, shape (n,); empty if there is no clear class."""
     left, right = (_comes_within(stream, HIDDEN_S, side) for side in SIDES)
     left_soon, right_soon = (_comes_within(stream, SECOND_S, side) for side in SIDES)
     both = (left & right_soon) | (right & left_soon)
     late_s = MOVING_LATE_S if stream.ego_moves else 0.0
     near, lately = _in_view(stream, FRONT_S[0] + late_s, FRONT_S[1]), _in_view(stream, 0.0, WINDOW_S)
-    # The hop at which it comes into view is still the last of the hidden ones.
+    # The hop at which a vehicle comes into view is still its last hidden one.
     covered = _in_view(stream, late_s + 0.5 * HOP_S, WINDOW_S)
     anyone = _comes_within(stream, CALM_S) | _comes_within(stream, CALM_S, quiet=True)
     calm = ~anyone & ~lately
-    # A vehicle in view covers one behind it: what is heard then is no clean window of either.
+    # A vehicle in view masks one behind it, so the window is a clean example of neither.
     clean = ~covered & ~_comes_within(stream, SECOND_S, quiet=True)
     one = (left & ~right_soon & clean, right & ~left_soon & clean)
     known = (both & clean, *one, near & ~anyone, calm)
@@ -80,7 +80,7 @@ def hop_labels(stream: HeardStream) -> TextArray:
 
 
 def stream_windows(streams: Sequence[HeardStream]) -> SimulatedWindows:
-    """Cut windows from streams, each compared with all that were cut at its site."""
+    """Cut windows from streams, with a reference of all windows of the same site."""
     cut = [_cut(stream) for stream in streams]
     features = np.concatenate([stream.hops.feature[rows] for stream, rows, _ in cut]).astype(np.float64)
     sites = np.concatenate([np.full(len(rows), stream.site) for stream, rows, _ in cut])
@@ -89,7 +89,7 @@ def stream_windows(streams: Sequence[HeardStream]) -> SimulatedWindows:
     for site in np.unique(sites):
         references[sites == site] = site_reference(log_levels(features[sites == site]))
     weights = WEIGHT * _balance(labels)
-    # All of a hazard says its own side: see `WEIGHT`.
+    # A hazard has all its weight on its own side: see `WEIGHT`.
     return SimulatedWindows(np.hstack([features, references]), labels, sites, weights, np.zeros(len(labels)))
 
 
@@ -104,7 +104,7 @@ def _cut(stream: HeardStream) -> tuple[HeardStream, IndexArray, TextArray]:
 
 
 def _balance(labels: TextArray) -> FloatArray:
-    """Return weights under which hidden, in view and empty weigh the same, as in the released windows."""
+    """Return weights with equal sums for hidden, in view and empty, as in the released windows."""
     weights, hidden = np.ones(len(labels)), np.isin(labels, (*SIDES, BOTH))
     for name in ("front", "none"):
         here = labels == name
@@ -113,7 +113,7 @@ def _balance(labels: TextArray) -> FloatArray:
 
 
 def _thinned(rows: IndexArray, time_s: FloatArray, apart_s: float) -> IndexArray:
-    """Return rows so far apart, counted from the last: that before a vehicle comes into view is kept."""
+    """Return rows at least this far apart; the last one, just before a vehicle is visible, is kept."""
     kept: list[int] = []
     for row in rows[::-1].tolist():
         if not kept or time_s[kept[-1]] - time_s[row] >= apart_s - 1e-6:
@@ -122,7 +122,7 @@ def _thinned(rows: IndexArray, time_s: FloatArray, apart_s: float) -> IndexArray
 
 
 def _comes_within(stream: HeardStream, seconds: float, side: str = "", *, quiet: bool = False) -> BoolArray:
-    """Tell when a vehicle, or a quiet one, out of a hidden arm comes into view so soon, shape (n,)."""
+    """Return the hops before a vehicle, or a quiet one, comes into view from a hidden arm, shape (n,)."""
     vehicles = stream.vehicles
     asked = vehicles.hazard & (np.isin(vehicles.kind, SILENT_KINDS) == quiet)
     entries = vehicles.entry_s[asked & ((vehicles.arm == side) | (side == ""))]
@@ -132,7 +132,7 @@ def _comes_within(stream: HeardStream, seconds: float, side: str = "", *, quiet:
 
 
 def _in_view(stream: HeardStream, after_s: float, stays_s: float) -> BoolArray:
-    """Tell from how long after a vehicle near by came into view to how long after it left, shape (n,)."""
+    """Return the hops between given times after a near vehicle's arrival and departure, shape (n,)."""
     rows, time = stream.rows, stream.hops.time_s
     near = np.zeros(len(time), np.bool_)
     seen = stream.in_view_within(NEAR_M)
@@ -151,12 +151,12 @@ def learned_beside(
 
 
 def window_model(table: FeatureTable, beside: SimulatedWindows | None) -> EnsembleModel:
-    """Fit a window model to a table and the windows beside it."""
+    """Fit a window model to a table and to additional windows."""
     return replace(fit_ensemble(with_site_references(table), beside), domain=table.domain)
 
 
 def posteriors_along(model: EnsembleModel, features: FloatArray) -> FloatArray:
-    """Return what `SiteSignature` finds hop by hop along a stream, as posteriors, shape (n, classes).
+    """Return the posteriors of `SiteSignature` hop by hop along a stream, shape (n, classes).
 
     Shapes: features (n, 60).
     """
@@ -168,23 +168,23 @@ def posteriors_along(model: EnsembleModel, features: FloatArray) -> FloatArray:
     return model.posteriors(log_levels(features), references)
 
 
-# 180 windows at a weight of .1 took the other side, named with p > .5, from .39 of the windows to .03
-# (prototype); more of them, or heavier ones, call real hidden vehicles direct.
+# 180 windows with a weight of 0.1 reduced those with p > 0.5 for the other side from 39 to 3 % (prototype).
+# With more windows, or more weight, real hidden vehicles are classified as direct.
 N_OPEN, OPEN_WEIGHT = 180, 1.0
 RATE_HZ = 6000.0
 SNR_DB = (-6.0, 25.0)
 DISTANCES_M, SPEEDS_MPS, MOVING_SHARE = (5.0, 60.0), (2.0, 12.0), 0.5
-# Engines and tyres fall by 0 to 9 dB an octave in the band of the feature.
+# Engines and tyres fall by 0 to 9 dB per octave in the band of the feature.
 _SLOPES_DB = (0.0, 9.0)
-# So much earlier than is heard is emitted: 60 m take .18 s.
+# Emission starts this long before reception, because sound takes 0.18 s over 60 m.
 _HEAD_S, _WINDOW_S, _SCALE_PA = 0.4, 1.0, 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class OpenSource:
-    """One source in the open: where it is in the middle of the window, how it moves, how loud it is.
+    """One source in the open: its position in the middle of the window, its motion and its level.
 
-    Nothing of it is of a site: such windows teach a model a source whose bearing is its direction.
+    It does not depend on a site. Such windows train a model on sources whose bearing is their direction.
     """
 
     azimuth_rad: float
@@ -194,7 +194,7 @@ class OpenSource:
 
 
 def drawn_source(rng: np.random.Generator) -> OpenSource:
-    """Draw a source at any azimuth; half of them stand.
+    """Draw a source at any azimuth; half of the sources are at rest.
 
     Examples
     --------
@@ -223,7 +223,7 @@ def _drawn_feature(array: MicrophoneArray, moving_ego: bool, rng: np.random.Gene
 
 
 def open_field_windows(features: FloatArray) -> SimulatedWindows:
-    """Return windows in the open as a model learns them: direct, and compared with no site.
+    """Return windows in the open for training: class direct, without a site reference.
 
     Shapes: features (n, 60).
     """
@@ -246,7 +246,7 @@ def open_feature(
         _add_source(sound, source, receiver, rng)
         add_ambience(ambience, receiver, open_road().site, preset(), rng)
     if ego_mps:
-        # Its own noise is part of what a source stands out from; that the array moves on is left out.
+        # The ego's own noise is part of the background; the motion of the array is left out.
         speed = np.full(receiver.samples, ego_mps)
         ambience += ego_noise(receiver.positions_m, speed, RATE_HZ, rng, preset().ego_engine_db).T
     gain = 10.0 ** (source.snr_db / 20.0) * _level(ambience) / _level(sound)
@@ -268,13 +268,12 @@ def _add_source(out: Float32Array, source: OpenSource, receiver: Receiver, rng: 
 
 
 def _tilted(samples: int, rng: np.random.Generator) -> Float32Array:
-    """Draw noise that falls by a drawn slope; below 50 Hz it is flat."""
+    """Draw noise with a random slope; below 50 Hz it is flat."""
     frequency = np.maximum(np.fft.rfftfreq(samples, 1.0 / RATE_HZ), FEATURE_BAND_HZ[0])
     shape = (frequency / FEATURE_BAND_HZ[0]) ** (-rng.uniform(*_SLOPES_DB) / 6.02)
     return np.asarray(np.fft.irfft(np.fft.rfft(rng.standard_normal(samples)) * shape, samples), np.float32)
 
 
 def _level(sound: Float32Array) -> float:
-    """Return the RMS over all microphones in the band of the feature."""
     band = scipy.signal.butter(4, FEATURE_BAND_HZ, "bandpass", fs=RATE_HZ, output="sos")
     return float(np.sqrt(np.square(scipy.signal.sosfilt(band, sound)).mean()))

@@ -1,7 +1,7 @@
-"""What a sequence model is worth on streams: approaches detected, alarms an hour, calibration, times.
+"""Exam of a sequence model on streams: detected approaches, alarms per hour, calibration, times.
 
-An approach is one vehicle, two that come from both sides at once, or one with another behind it; the next one
-lies farther away than an alarm is counted for, so that the first hop in alarm counts.
+An approach is one vehicle, two from both sides at once, or one with another behind it. The next approach is
+farther away than the longest lead time of an alarm, so the first hop in alarm is used.
 """
 
 import math
@@ -41,17 +41,17 @@ from .heard_stream import ROW_S, HeardStream
 from .road_user_training import CLASS_OF
 from .sequence_training import QUIET_KINDS, StreamTruth
 
-# A second vehicle arrives up to six seconds after the first; drivers differ by half a second more.
+# A second vehicle arrives up to six seconds after the first; drivers differ by another half second.
 TOGETHER_S = 7.0
 _SECOND = {"both": "both", "queue": "follows"}  # Flow of the second vehicle by that of the first
 _CALIBRATED_S = (1.0, 2.0, 3.0)
-# The ten hops before T0, without T0 itself: there the vehicle is as good as in view.
+# The ten hops before T0; at T0 itself the vehicle is practically in view.
 _LAST_SECOND_S = np.arange(1, 11) * HOP_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExaminedStream:
-    """A stream, the readings of a model, and the advisories of the filter with an alarm set without it."""
+    """A stream, a model's readings, and the advisories of the filter with an independently set alarm."""
 
     heard: HeardStream
     truth: StreamTruth
@@ -60,7 +60,7 @@ class ExaminedStream:
 
 
 def approaches(heard: HeardStream) -> list[StreamApproach]:
-    """Collect the approaches of a stream by the flows that its vehicles arrived in."""
+    """Collect the approaches of a stream from the flows of its vehicles."""
     vehicles = heard.vehicles
     order = np.argsort(vehicles.entry_s)
     left = [i for i in order.tolist() if vehicles.hazard[i] and np.isfinite(vehicles.entry_s[i])]
@@ -68,7 +68,7 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
     while left:
         first = left.pop(0)
         flow, entry_s = vehicles.flow[first], vehicles.entry_s[first]
-        # A follower's leader is the only one of its arm so shortly before it.
+        # A follower's leader is the only vehicle of its arm this shortly before it.
         second = [
             i
             for i in left
@@ -90,7 +90,7 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
 
 
 def smoothed_log_odds(posterior: SequencePosterior) -> FloatArray:
-    """Return the mean over .3 s of the log-odds of coming into view within three seconds, shape (n, 2)."""
+    """Return the 0.3 s mean of the log-odds of coming into view within three seconds, shape (n, 2)."""
     within = np.clip(posterior.within()[..., -1], TINY, 1.0 - TINY)
     log_odds = np.log(within) - np.log1p(-within)
     recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
@@ -102,7 +102,7 @@ def _louder(posterior: SequencePosterior) -> FloatArray:
 
 
 def examine(streams: Sequence[ExaminedStream]) -> Figures:
-    """Return the figures of some streams together, ready for a table and for JSON."""
+    """Return the figures of some streams together, for a table and for JSON."""
     every = _table(streams)
     loud = every.loud()
     found = loud.detections()
@@ -118,8 +118,8 @@ def examine(streams: Sequence[ExaminedStream]) -> Figures:
 def alarm_outcomes(
     heard: HeardStream, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
 ) -> list[ApproachOutcome]:
-    """Return the outcome of every approach that lies whole within the hops, shapes (n,) and (n, 2)."""
-    # The hops of a drive are all there is: its vehicles come out before the horizon of 8 s has passed.
+    """Return the outcome of every approach that is entirely within the hops, shapes (n,) and (n, 2)."""
+    # A drive has no other hops: its vehicles come into view before the horizon of 8 s has passed.
     before_s = 0.0 if heard.ego_moves else HORIZON_S
     return [
         hop_outcome(one, time_s, raised, longest_s)
@@ -143,7 +143,7 @@ def approach_table(
 
 
 def _ranking(streams: Sequence[ExaminedStream]) -> Figures:
-    """Return the mean AUROC over the last second before T0, and that at single times before it."""
+    """Return the mean AUROC over the last second before T0, and the AUROC at single earlier times."""
     times = {f"auroc_{before:g}s_before": np.array([before]) for before in _CALIBRATED_S}
     asked = {"auroc_last_second": _LAST_SECOND_S, **times}
     areas = {name: float(auroc_before(streams, before_s).mean()) for name, before_s in asked.items()}
@@ -151,8 +151,7 @@ def _ranking(streams: Sequence[ExaminedStream]) -> Figures:
 
 
 def _by_kind(told: Sequence[ApproachOutcome]) -> Figures:
-    """Return three figures for each kind that came alone, quiet ones too."""
-    # With a bicycle comes a car in half of the others, and the car is what is heard.
+    # In half of the other approaches a car comes with a bicycle, and the car is the audible one.
     alone = [one for one in told if len(one.approach.kinds) == 1]
     found: Figures = {}
     for kind in sorted({one.approach.kinds[0] for one in alone}):
@@ -163,7 +162,7 @@ def _by_kind(told: Sequence[ApproachOutcome]) -> Figures:
 
 
 def _worst(streams: Sequence[ExaminedStream]) -> Figures:
-    """Return what is detected at the junction with the least of it, and the most onsets of any junction."""
+    """Return the detected share at the worst junction, and the most onsets of any junction."""
     sites = np.array([one.heard.site for one in streams])
     there = [
         _table([streams[i] for i in np.flatnonzero(sites == site).tolist()]).loud().figures()
@@ -195,7 +194,7 @@ def chance_figures(within: FloatArray, coming_s: FloatArray) -> Figures:
 
 @dataclass(frozen=True, slots=True)
 class VisibleErrors:
-    """Errors of stated times, and what the constants that fit these very truths best would reach.
+    """Errors of stated times, and of the best constants for the same truths.
 
     Examples
     --------
@@ -209,20 +208,20 @@ class VisibleErrors:
     (1.19, nan)
     """
 
-    count: int  # Times that were stated and can be checked
-    intervals: int  # Of these, with an interval
-    rmse_s: float  # Of the best value
+    count: int  # Number of stated times that can be checked
+    intervals: int  # Number of those with an interval
+    rmse_s: float  # Error of the best value
     coverage: float  # Share of truths within the stated interval
-    width_s: float  # Mean width of the stated interval
-    # Fitted to the truths themselves, so that no constant known beforehand does better.
+    width_s: float
+    # Fitted to the truths themselves, so that no constant known in advance is better.
     constant_rmse_s: float
 
 
 def visible_errors(stated: FloatArray, true_s: FloatArray) -> VisibleErrors:
     """Compare stated times to visible, low, best and high (n, 3), with the true seconds (n,).
 
-    Rows without a best value, or that never come into view, are left out. Coverage and width are those of
-    the rows that have an interval, NaN where none has: a method may state a time alone.
+    Rows without a best value or without a finite true time are left out. Coverage and width refer to the rows
+    with an interval; they are NaN without any, because a method may state a time alone.
 
     Examples
     --------
@@ -248,7 +247,7 @@ def visible_errors(stated: FloatArray, true_s: FloatArray) -> VisibleErrors:
 
 
 def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:
-    """Return the errors of stated times of vehicles that come within five seconds; None where none is stated.
+    """Return the errors of stated times for vehicles that come within five seconds; None without any.
 
     Shapes: stated (n, 3), coming_s (n,).
     """
@@ -264,13 +263,13 @@ def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:
 
 
 def warned_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
-    """Return the share of approaches whose alarm stood that long before T0 or earlier, shape (times,)."""
+    """Return the share of approaches with an alarm that long before T0 or earlier, shape (times,)."""
     leads = np.array([one.lead_s for one in _table(streams).loud().outcomes])
     return np.array([np.mean(leads > before) if leads.size else np.nan for before in before_s])
 
 
 def auroc_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
-    """Return the AUROC of what alarms are read from, so long before T0 against hazard-free hops, (times,)."""
+    """Return the AUROC of the alarm's score at times before T0 against hazard-free hops, shape (times,)."""
     quiet = [_louder(one.posterior) for one in streams if one.heard.hazard_free]
     if not quiet:
         return np.full(len(before_s), np.nan)
@@ -291,7 +290,7 @@ def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
     return np.asarray(scores[at[(at >= 0)]])
 
 
-# Of wrong mountings only what they may cost, by heading.
+# Columns for wrong mountings: only the figures that a mounting may change.
 _COST_OF = {
     "AUROC last s": "auroc_last_second",
     "detected": "detected",
@@ -309,9 +308,9 @@ _OF_OTHERS = (
 
 
 def exam_figures(streams: Sequence[ExaminedStream]) -> Figures:
-    """Return the figures of an exam, ready for a table and for JSON.
+    """Return the figures of an exam, for a table and for JSON.
 
-    Those of the first renderer have no prefix, and some of each other one have its name before them.
+    Figures of the first renderer have no prefix; some of each other renderer have its name as a prefix.
     """
     of = {name: [one for one in streams if one.heard.renderer == name] for name in _RENDERERS}
     first = of.pop("paths")
@@ -323,7 +322,7 @@ def exam_figures(streams: Sequence[ExaminedStream]) -> Figures:
 
 
 def with_exam(model: Model, figures: Figures) -> Model:
-    """Return a model whose card states what its exam found, of each kind of road user, too."""
+    """Return a model with the exam's results on its card, also for each kind of road user."""
     card = ("approaches", "auroc_1s_before", "both_sides_found", *_COST_OF.values())
     exam = {name: float(value) for name in card if (value := figures.get(name)) is not None}
     kinds = [name.removeprefix("approaches_") for name in figures if name.startswith("approaches_")]
@@ -337,7 +336,7 @@ def with_exam(model: Model, figures: Figures) -> Model:
 
 
 def beside_reference(report: Mapping[str, object], reference: Mapping[str, float]) -> dict[str, object]:
-    """Return a report for people, with the figures of the 56 microphones behind those that have one.
+    """Return a report for people; figures of the 56 microphones are shown behind the model's own.
 
     Examples
     --------
@@ -353,7 +352,7 @@ def beside_reference(report: Mapping[str, object], reference: Mapping[str, float
 
 
 def mounting_lines(mounted: Mapping[str, Figures]) -> list[str]:
-    r"""Return a table of what each mounting reaches.
+    r"""Return a table of the results of each mounting.
 
     Examples
     --------
@@ -361,12 +360,12 @@ def mounting_lines(mounted: Mapping[str, Figures]) -> list[str]:
     >>> print("\n".join(mounting_lines({"as mounted": figures})))
     mounted          | AUROC last s | detected | lead s | onsets/h | bearing deg
     as mounted       |            - |     0.85 |      - |        - |        3.14
-    sound and camera 50 ms apart: a bearing lies 1.3 deg beside its box
+    sound and camera 50 ms apart: bearings differ from boxes by 1.3 deg
     """
     lines = exam_lines("mounted", mounted)
     apart = next((one.get("offset_50ms_deg") for one in mounted.values()), None)
     if apart is not None:
-        lines.append(f"sound and camera 50 ms apart: a bearing lies {apart:.2g} deg beside its box")
+        lines.append(f"sound and camera 50 ms apart: bearings differ from boxes by {apart:.2g} deg")
     return lines
 
 
@@ -383,24 +382,25 @@ def _cell(value: object, width: int) -> str:
     return f"{'-' if value is None else format(value, '.3g'):>{width}}"
 
 
-NEAR_M = 20.0  # Farther away a vehicle in view is no louder than the street
-OFFSET_S = 0.05  # Between the clocks of sound and camera
+NEAR_M = 20.0  # Farther away, a vehicle in view is no louder than the street
+OFFSET_S = 0.05  # Offset between the clocks of sound and camera
 
 
 def in_view_bearings(streams: Sequence[HeardStream]) -> dict[str, float | None]:
-    """Return the median error of bearings of the loudest vehicle in view, and its turn in the offset."""
+    """Return the median bearing error of the loudest vehicle in view, and its turn during the offset."""
     errors = np.concatenate([_errors_rad(one) for one in streams])
     turned = np.concatenate([_turn_rates(one) for one in streams]) * OFFSET_S
     return {
         "bearing_error_deg": float(np.degrees(np.median(errors))) if errors.size else None,
-        # What a box lies beside its bearing where the camera is so much earlier or later: truth alone.
+        # Angle between box and bearing with this offset of the camera's clock; it follows from the truth
+        # alone.
         "offset_50ms_deg": float(np.degrees(np.median(turned))) if turned.size else None,
         "offset_50ms_95_deg": float(np.degrees(np.quantile(turned, 0.95))) if turned.size else None,
     }
 
 
 def _errors_rad(heard: HeardStream) -> FloatArray:
-    """Return how far bearings are from the loudest vehicle in view near by, one a hop."""
+    """Return the bearing errors for the loudest near vehicle in view, one per hop."""
     rows = heard.rows
     hop, inside = heard.row_hops()
     seen = heard.in_view_within(NEAR_M) & inside
@@ -411,7 +411,7 @@ def _errors_rad(heard: HeardStream) -> FloatArray:
 
 
 def _turn_rates(heard: HeardStream) -> FloatArray:
-    """Return how fast vehicles in view near by turn round the array, rad/s, one a row and next."""
+    """Return the angular rates of near vehicles in view, rad/s, one per pair of rows."""
     rows = heard.rows
     near = heard.in_view_within(NEAR_M)
     on = (np.diff(rows.vehicle) == 0) & near[1:] & near[:-1]
@@ -422,7 +422,7 @@ BEFORE_S = np.linspace(0.0, 5.0, 26)
 
 
 def write_exam_figure(streams: Sequence[ExaminedStream], path: Path) -> None:
-    """Draw the share of approaches in alarm and the AUROC against the time before T0, site by site."""
+    """Draw the share of approaches in alarm and the AUROC against the time before T0, for every site."""
     sites = sorted({one.heard.site for one in streams})
     with figure_file(path, 9.0, 3.6) as figure:
         warned, ranked = figure.subplots(1, 2)
@@ -434,7 +434,7 @@ def write_exam_figure(streams: Sequence[ExaminedStream], path: Path) -> None:
         for site in sites:
             here = [one for one in streams if one.heard.site == site]
             onsets = examine(here)["onsets_per_hour"]
-            told = site if onsets is None else f"{site}, {onsets:.0f} an hour"
+            told = site if onsets is None else f"{site}, {onsets:.0f} per hour"
             draw(here, linewidth=1.0, label=told)
         draw(streams, color="black", label="all")
         warned.set(ylim=(0.0, 1.0), xlabel="seconds to T0", ylabel="approaches in alarm by then")

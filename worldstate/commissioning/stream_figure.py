@@ -1,4 +1,4 @@
-"""One figure of a simulated stream: the ways of its vehicles from above, and what was heard of them."""
+"""Figure of a simulated stream: the paths of its vehicles from above, and its sound."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,18 +13,18 @@ from worldstate.simulation.stream.writing import WrittenStream
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Rows of the events: first what comes out of a hidden arm, then each kind of negative.
+# Rows of the events: vehicles from a hidden arm first, then each kind of negative.
 FLOWS = (
     "left", "right", "both", "queue", "follows", "waits", "turns_away", "parks", "far", "from_behind",
     "from_ahead", "stands", "leaves", "joins", "stops", "distant",
 )  # fmt: skip
-MAP_M = 60.0  # as far to the sides
+MAP_M = 60.0  # to either side
 WALLS_M = 12.0  # the ego's own street is drawn this far behind it
-COLUMNS = 1600  # of the spectrogram: more than the figure has dots
+COLUMNS = 1600  # of the spectrogram; the figure has fewer dots
 
 
 def write_stream_figure(stream: WrittenStream, path: Path) -> None:
-    """Draw ways, spectrogram and events of a stream; the kind of file follows from the ending of its name."""
+    """Draw paths, spectrogram and events of a stream; the file name's ending gives the file type."""
     with figure_file(path, 11.0, 9.0) as figure:
         above, middle, below = figure.subplots(3, 1, height_ratios=(0.8, 0.9, 1.0))
         _draw_map(above, stream)
@@ -41,8 +41,7 @@ def _draw_map(axes: "Axes", stream: WrittenStream) -> None:
         axes.plot(*np.array(line).T, color="black", linewidth=2.0)
     for one in stream.vehicles:
         for shown, colour, label in ((~one.in_view, HIDDEN, "hidden"), (one.in_view, IN_VIEW, "in view")):
-            # Those of one flow drive on the same lane: a line each, a hand's breadth beside the last one.
-            beside = 0.15 * (one.number % 8 - 3.5)
+            beside = 0.15 * (one.number % 8 - 3.5)  # Side by side: vehicles of one flow use the same lane
             y, x = (np.where(shown, value, np.nan) for value in (one.y_m, one.x_m + beside))
             axes.plot(y, x, color=colour, linewidth=0.8, label=label)
     axes.plot(0.0, 0.0, "^", color="black", markersize=9, label="array")
@@ -51,7 +50,7 @@ def _draw_map(axes: "Axes", stream: WrittenStream) -> None:
 
 
 def _walls(site: Site) -> list[list[tuple[float, float]]]:
-    """Corners and walls as polylines of (y, x)."""
+    """Return corners and walls as polylines of (y, x)."""
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     lines = [
         [(MAP_M, mouth), (left, mouth), (site.side_wall_left_m, -WALLS_M)],
