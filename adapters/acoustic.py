@@ -1,4 +1,4 @@
-"""Acoustic measurement adapter: blocks of samples in, measurements out."""
+"""The acoustic adapter turns blocks of samples into measurements."""
 
 import math
 from collections import Counter
@@ -40,25 +40,26 @@ from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.measurement import Approach, Bearing, CoEvidenceChannel, Heard, Measurement
 from worldstate.measurement.measurement import MeasurementAdapter
 
-# Loudness is the mean of these bands: of others it would not be what a sequence was trained on.
+# Loudness is the mean level of these bands. The sequence models were trained with this definition.
 LEVEL_BAND_HZ = (50.0, 2700.0)
-# Six simulated demos, error of the evidence of a side: .2 nats with 28 of 56 channels dead, 1.2 with 42, 2.1
-# with 50; .06 where a tenth of the samples clips, .7 with four tenths (the change within a second: .46).
+# Simulated demos (n = 6), error of the evidence per side: 0.2 nats with 28 of 56 channels dead, 1.2 with 42,
+# 2.1 with 50; 0.06 nats if a tenth of the samples clips, 0.7 if four tenths do (the evidence changes by 0.46
+# within 1 s).
 _DEAD, _CLIPPED = (0.5, 0.85), (0.1, 0.5)
-# Decibels above the quiet street of a source in view from which it hides others. Never all: it is heard that
-# it is one source, and a louder one behind it would be noticed.
+# A source in view masks others if its level is this far above the quiet street. Masking is never complete,
+# because a second, louder source behind it can still be detected.
 _LOUD_DB, _MOST_MASKED = (6.0, 15.0), 0.75
-# Above, nothing that is worth a reason.
+# Above this share no reason is given.
 _SAID = 0.95
-# Why little is heard beside a sound that the guard calls foreign.
+# Reason for a low audibility beside a sound that the guard rejects as foreign.
 FOREIGN = "a sound that the models do not know"
-# Of a bearing: with a larger one the whole side is searched for co-evidence instead of a sector. Up to there
-# nine of ten simulated vehicles in view lie in the sector that the camera is asked about.
+# If the standard deviation of the bearing is larger, the whole side is searched for co-evidence, not a
+# sector. Below it, the sector contains nine of ten simulated vehicles in view.
 _COARSE_STD_RAD = math.radians(25.0)
 
 
 class Signature(Protocol):
-    """What is asked of a signature model; `abduction.signature.published_signature.SignatureModel` is one.
+    """Interface of a signature model such as `abduction.signature.published_signature.SignatureModel`.
 
     Examples
     --------
@@ -74,54 +75,55 @@ class Signature(Protocol):
 
 
 class AcousticAdapter(MeasurementAdapter[Float32Array]):
-    """Measures hidden and visible road users by their sound, and asks the camera about what it hears.
+    """Measures hidden and visible road users by their sound, with co-evidence from a camera.
 
     Parameters
     ----------
     array : MicrophoneArray
-        One microphone a channel.
+        One microphone per channel.
     sample_rate_hz : float
-        Of the blocks.
+        Sample rate of the blocks.
     model : Signature or None
-        From the feature of a window to log-likelihoods; without one nothing but bearings is measured.
+        Maps the feature of a window to log-likelihoods. Without a model only bearings are measured.
     vision : CoEvidenceChannel, optional
-        Asked once a hop; without one every answer is `Unqueried`.
+        Camera, searched once per hop. Without it the co-evidence is `Unqueried`.
     start_ns : int
         Stamp of the first sample on the stream's clock.
     front_end_settings : FrontEndSettings, optional
-        Of the front-end.
+        Settings of the front-end.
     grounding : Grounding, optional
-        Weighs the model's scores with bearing, approach and engine line, eq. (5); the scores as they are
-        without.
-
+        Combines the model's scores with bearing, approach rate and engine line by eq. (5). Without it the
+        scores are used unchanged.
     guard : DomainGuard, optional
-        Tells foreign sounds and warning signals; evidence of a foreign one counts by what exceeds its margin.
+        Detects foreign sounds and warning signals. The evidence of a foreign sound is reduced by the guard's
+        margin.
     road_users : RoadUserModel, optional
-        Tells which kind of road user is heard; the camera is asked for such.
+        Classifies road users by their sound; the camera is searched for these classes.
     sequence : SequenceReader or NotUsable, optional
-        Reads from seconds of evidence which sides a vehicle comes from, and when; or why nothing does.
+        Estimates from seconds of evidence from which sides a vehicle comes, and when; or the reason why it is
+        not used.
     uncalibrated : bool
-        Go on with another array, rate or band than the model was made for. Give the filter a policy of
-        alpha 0 then, which states no budget.
+        Accept another array, sample rate or band than the model was made for. Then give the filter a policy
+        with alpha 0, because no false-alarm budget holds.
     kinds : mapping of str to float, optional
-        Of each kind of road user, the share that the exam of the model detected.
+        Share of each kind of road user that the model detected in its evaluation.
 
     Attributes
     ----------
     source : str
         ``"acoustic"``.
     front_end : FrontEnd
-        Turns blocks into frames; for those who want both, with `interpret`.
+        Turns blocks into frames. Use it with `interpret` if you need both frames and measurements.
     last_frame : AcousticFrame or None
-        What was heard last, for plots.
+        Frame of the last hop, for plots.
 
     Raises
     ------
     InvalidArgumentError
         If the array, the rate or a setting does not fit; see `FrontEnd`.
     OutOfDomainError
-        If the model has a `domain` and was made for another array, rate or feature, or guard or road users
-        for other measures.
+        If the model has a `domain` and was made for another array, rate or feature, or if the guard or the
+        road user model was made for other measures.
 
     Examples
     --------
@@ -153,13 +155,13 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     ) -> None:
         domain: ModelDomain | None = getattr(model, "domain", None)
         if front_end_settings is None:
-            # A model of one's own hears sound as it is recorded.
+            # A model without a domain receives the sound at its recorded rate.
             own = FrontEndSettings(nfft=feature_nfft(sample_rate_hz))
             front_end_settings = own if domain is None else FrontEndSettings.heard_at(sample_rate_hz)
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)
             front_end_settings = replaced(front_end_settings, feature_order=order)
-        if model is None:  # What begins to sound is what its bearings are of
+        if model is None:  # The bearings are those of sounds that begin
             front_end_settings = replaced(front_end_settings, mask_rises=False)
         if guard is not None and guard.measures != MEASURES:
             raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
@@ -194,38 +196,38 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         Returns
         -------
         list of Measurement
-            The first after the first full second, then one every 0.1 s.
+            The first after one second, then one every 0.1 s.
 
         Raises
         ------
         InvalidArgumentError
-            On another number of channels, NaN or infinity.
+            If the number of channels is wrong, or a sample is NaN or infinite.
         """
         return [self.interpret(frame) for frame in self.front_end.process(block)]
 
     def take_spectra(self, spectra: GivenSpectra, start_ns: int) -> None:
-        """Read spectra that were computed elsewhere, and one channel of sound."""
+        """Use spectra that were computed elsewhere, and one channel of sound."""
         rate, settings = self.front_end.sample_rate_hz, self.front_end.settings
         self.front_end = SpectrumFrontEnd(spectra, rate, settings, start_ns=start_ns)
 
     def interpret(self, frame: AcousticFrame, outside: str | None = None) -> Measurement:
-        """Turn what was heard at one hop into a measurement, the camera's answer included.
+        """Turn a frame into a measurement that includes the result of the camera.
 
-        The bearing of direct sound votes for its side; that of reflected sound, or a coarse one, says which
-        half of the street the peak is in, not where the vehicle is: then the side is the signature's. Nothing
-        is read of a hop that is `outside` of what the models learned, which is the reason why.
+        The bearing of direct sound is evidence for its side. The bearing of reflected sound, or a coarse one,
+        gives only the half of the street in which the peak is, so the signature determines the side. If
+        `outside` gives a reason why the hop is out of the models' domain, the models are not applied.
         """
-        # Without a model a loud sound is no vehicle in view, which hides others.
+        # Without a model, a loud sound cannot be taken for a vehicle in view that masks others.
         loud = replaced(frame, peaks=()) if self._model is None else frame
         self.last_frame, heard = frame, Heard(0.0, outside) if outside else heard_of(loud, self._kinds)
         told: dict[str, Any] = {"stamp_ns": frame.stamp_ns, "kinds": (), "heard": heard}
         told |= self._read(frame, heard) if heard.usable else self._unheard(heard)
         told |= _asked(told, self._vision)
-        # One value for all of it: what it holds is checked once.
+        # Built at once, so that it is validated only once.
         return Measurement(**told, source=self.source, fault=_array_fault(frame))
 
     def _unheard(self, heard: Heard) -> dict[str, Any]:
-        """Return the parts of the measurement of a hop that could not be heard, with even likelihoods."""
+        """Return the parts of the measurement of an unusable hop, with even likelihoods."""
         refused, reader = NotUsable(heard.reason or "not heard"), self._sequence
         if isinstance(reader, SequenceReader):
             reader.miss()
@@ -237,7 +239,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         }
 
     def _read(self, frame: AcousticFrame, share: Heard) -> dict[str, Any]:
-        """Return the parts of the measurement of a hop that the models read in it."""
+        """Return the parts of the measurement that the models infer from a hop."""
         if self._model is None:
             return self._unheard(share) | {"bearing": _bearing(frame), "approach": _approach(frame)}
         heard = signature = self._model.evidence(frame.feature)
@@ -252,14 +254,14 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
             share = beside_foreign(domain, share)
-        # Of what the model said alone: bearing and looming are inputs of a sequence themselves.
+        # Uses the model's evidence alone, because bearing and looming are separate inputs of the sequence.
         reader = self._sequence
         sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
         read = {"heard": share, "signature": signature, "bearing": bearing, "approach": approach}
         return read | {"domain": domain, "kinds": kinds, "sequence": sequence}
 
     def _recognised(self, frame: AcousticFrame) -> tuple[DomainVerdict | None, ClassShares]:
-        """Return whether the models know such sound, and which road users it may be of."""
+        """Return whether the sound is within the models' domain, and the likely road users."""
         character, guard, model = frame.character, self._guard, self._road_users
         if isinstance(character, NotUsable):
             return None, ()
@@ -270,10 +272,10 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
 def read_hop(
     reader: SequenceReader, signature: SignatureEvidence, frame: AcousticFrame
 ) -> SequenceReading | NotUsable:
-    """Return what a sequence says after one more hop, from what its window model and the front-end say."""
+    """Return the result of a sequence after one more hop of evidence and front-end measures."""
     sides = signature.sides
     if sides is None:
-        return NotUsable("the model says nothing of single sides")
+        return NotUsable("the model has no evidence per side")
     looming = frame.looming
     rate_hz = std_hz = np.nan
     if not isinstance(looming, NotUsable):
@@ -292,15 +294,15 @@ def read_hop(
 
 
 def heard_of(frame: AcousticFrame, kinds: Mapping[str, float] | None = None) -> Heard:
-    """Return how likely a hidden vehicle would have been noticed in the sound of a hop.
+    """Return the probability that a hidden vehicle would have been detected in the sound of a hop.
 
-    The least of what lost samples and noise, channels that are left out, clipping and a loud source in view
-    leave. Beside it stand the shares of kinds of road users in the exam of the model.
+    It is the minimum over lost samples, noise, excluded channels, clipping and a loud source in view. `kinds`
+    is the share of each kind of road user that the model detected in its evaluation.
     """
     if frame.heard is None:
         return Heard(measured=False)
     if (frame.feature <= 0.0).any():
-        # No two microphones that are trusted.
+        # Fewer than two microphones are usable.
         return Heard(0.0, frame.unheard or "dead channels")
     in_view = direct_probability(frame.peaks) * (1.0 - falling(frame.excess_db, _LOUD_DB))
     left = [(frame.heard, frame.unheard), (1.0 - _MOST_MASKED * in_view, "loud source in view")]
@@ -313,22 +315,22 @@ def heard_of(frame: AcousticFrame, kinds: Mapping[str, float] | None = None) -> 
 
 
 def beside_foreign(foreign: Foreign, heard: Heard) -> Heard:
-    """Return how likely a hidden vehicle would have been noticed beside a sound that is not known.
+    """Return the probability that a hidden vehicle would have been detected beside a foreign sound.
 
-    As likely as the sound is not foreign: a model that was not made for it reads neither a vehicle nor
-    silence in it, and what was believed before is carried on.
+    The share is multiplied by the probability that the sound is not foreign. A model that was not trained on
+    a sound can infer neither a vehicle nor silence from it, so the earlier belief is kept.
     """
     return replaced(heard, share=heard.share / (1.0 + math.exp(min(foreign.log_odds, 700.0))), reason=FOREIGN)
 
 
 def asked_again(measurement: Measurement, vision: CoEvidenceChannel | None) -> Measurement:
-    """Return a measurement with the answers of a camera, or of none; what was heard stays as it is."""
+    """Return a measurement with new results of a camera, or of none. The acoustic part is unchanged."""
     told = {name: getattr(measurement, name) for name in ("stamp_ns", "bearing", "kinds", "signature")}
     return replaced(measurement, **_asked(told, vision))
 
 
 def _asked(told: Mapping[str, Any], vision: CoEvidenceChannel | None) -> dict[str, Any]:
-    """Return what a camera answers of the sound of a measurement, or that there is none."""
+    """Return the results of a camera for the sound of a measurement, `Unqueried` without a camera."""
     if vision is None:
         return {"co_evidence": Unqueried("no camera"), "sightings": (), "look": None, "further": ()}
     stamp_ns, bearing, labels = told["stamp_ns"], told["bearing"], expected_labels(told["kinds"])
@@ -356,7 +358,7 @@ def _approach(frame: AcousticFrame) -> Approach | NotUsable:
 
 
 def _array_fault(frame: AcousticFrame) -> str | None:
-    """Return why all of the microphones are not heard, or how many have which fault; None if all is well."""
+    """Return why no microphone is usable, or the number of microphones per fault; None without a fault."""
     health = frame.health
     if frame.heard is not None and frame.heard < LEAST_HEARD and frame.unheard in ARRAY_FAULTS:
         return frame.unheard
@@ -369,9 +371,9 @@ def _array_fault(frame: AcousticFrame) -> str | None:
 def observe(
     frame: AcousticFrame, bearing: Bearing | NotUsable, rate: Approach | NotUsable
 ) -> GroundedObservation:
-    """Return what a frame says beside its feature; spreads are those of the estimators' own bounds."""
-    # Where the front-end looks for an engine line (`FrontEndSettings.tone_band_hz`), it is the spacing of the
-    # harmonics: two firings a turn leave the first of them the strongest.
+    """Return the observables of a frame other than its feature, with the estimators' standard deviations."""
+    # An engine line within `FrontEndSettings.tone_band_hz` is the spacing of the harmonics: with two firings
+    # per revolution the first harmonic is the strongest.
     tone, lines = frame.tone, {}
     if not isinstance(tone, NotUsable):
         lines[LINE_SPACING] = Observable(tone.frequency_hz, tone.frequency_std_hz)
