@@ -1,1 +1,1 @@
-"""Cameras, detectors, their detections, and how often they miss."""
+"""Cameras, detectors, their detections and their miss rates."""

@@ -1,4 +1,4 @@
-"""Boxes of one image and of the next: which overlap, which belong to one vehicle."""
+"""Overlap of boxes, and linking of boxes in successive images."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -7,18 +7,18 @@ import numpy as np
 
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-_SPAN = 4  # Boxes whose motion predicts the next one
+_SPAN = 4  # Number of last boxes whose motion predicts the next one
 
 
 @dataclass(frozen=True, slots=True)
 class AzimuthBox:
-    """A box in one image by its azimuths; an edge or a height that the image cuts is NaN."""
+    """A box in one image by its azimuths; an edge or height that the image border cuts is NaN."""
 
     time_s: float
     left_rad: float
     right_rad: float
     middle_rad: float
-    height_rad: float  # Over the depth of its near side
+    height_rad: float  # Height over the depth of its near side
     label: str
 
 
@@ -41,9 +41,9 @@ def _areas(boxes_px: FloatArray) -> FloatArray:
 
 
 def gated_pairs(cost: FloatArray, within: BoolArray, price: float | FloatArray) -> IndexArray:
-    """Return row and column of each pair of the cheapest assignment, shape (k, 2), within the gate.
+    """Return row and column of each pair of the cheapest assignment within the gate, shape (k, 2).
 
-    In the choice, a pair that is not within it costs `price`.
+    In the assignment, a pair outside the gate has the cost `price`.
 
     Examples
     --------
@@ -52,7 +52,7 @@ def gated_pairs(cost: FloatArray, within: BoolArray, price: float | FloatArray) 
     array([[0, 0],
            [2, 1]])
     """
-    # Imported where it is used: it takes 0.4 s, which a command that only prints its options would pay.
+    # Imported here because it takes 0.4 s, which a command that only prints its options need not spend.
     from scipy.optimize import linear_sum_assignment
 
     rows, columns = linear_sum_assignment(np.where(within, cost, price))
@@ -63,9 +63,9 @@ def gated_pairs(cost: FloatArray, within: BoolArray, price: float | FloatArray) 
 def linked_boxes(
     images: Iterable[tuple[float, Sequence[AzimuthBox]]], gate_rad: float, longest_gap_s: float
 ) -> list[list[AzimuthBox]]:
-    """Join the boxes of successive images to tracks, each box to the one that predicts it within a gate.
+    """Link the boxes of successive images to tracks, each to the track that predicts it within the gate.
 
-    A track that has no box for longer than the gap ends. Images come as their time and their boxes.
+    A track ends if it has no box for longer than the gap. Each image is given as its time and its boxes.
     """
     tracks: list[list[AzimuthBox]] = []
     closed: list[list[AzimuthBox]] = []
@@ -83,7 +83,7 @@ def linked_boxes(
 
 
 def _predicted_rad(boxes: Sequence[AzimuthBox], time_s: float) -> float:
-    """Return where the next box of a track is expected, from the motion of its last ones."""
+    """Return the azimuth of a track's next box, extrapolated from its last boxes."""
     last, before = boxes[-1], boxes[-_SPAN:][0]
     if last.time_s == before.time_s:
         return last.middle_rad

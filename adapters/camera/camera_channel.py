@@ -1,4 +1,4 @@
-"""A camera with a detector and measured miss rates, whose degradation is read from its own images."""
+"""Detections of a video with measured miss rates, and the camera's degradation estimated from its images."""
 
 from collections.abc import Callable
 
@@ -12,12 +12,12 @@ from .detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
 from .miss_rates import MissRates
 from .video import Video
 
-# Period of the degradation estimate: it costs as much as a detection, and dirt or dusk take longer.
+# Period of the degradation estimate, which costs as much as a detection; soiling and dusk are slower.
 HEALTH_PERIOD_NS = 400_000_000
 
 
 class ImageHealth:
-    """Degradation d of a camera, read from its images once a period; 0 without a scale of its health."""
+    """Degradation d of a camera, estimated from its images once per period; 0 without a health scale."""
 
     def __init__(self, rates: MissRates | None, period_ns: int = HEALTH_PERIOD_NS) -> None:
         self._rates, self._period_ns = rates, period_ns
@@ -26,7 +26,7 @@ class ImageHealth:
         self.level = 0.0
 
     def read(self, stamp_ns: int, frame: ImageArray) -> float:
-        """Take the next image; return d as last read."""
+        """Process the next image; return the latest d."""
         due = self._read_ns is None or stamp_ns - self._read_ns >= self._period_ns
         if due and self._monitor is not None and self._rates is not None:
             self._read_ns = stamp_ns
@@ -37,9 +37,9 @@ class ImageHealth:
 def seen_in(
     video: Video, detector: Detector, rates: MissRates | None, start_ns: int = 0
 ) -> tuple[DetectionLog, DegradationLog]:
-    """Return what a new detector finds in a video, each image decoded once, and d as last read from it.
+    """Return a detector's detections in a video and the latest d per image; each image is decoded once.
 
-    Rates are those measured for this detector and camera; without the scale of its health d is 0.
+    The rates must have been measured with this detector and camera. Without a health scale d is 0.
     """
     health, found = ImageHealth(rates), list[DetectionFrame]()
 
@@ -65,5 +65,5 @@ def _levels(video: Video, read: Callable[[int, ImageArray], float], start_ns: in
 
 
 def any_motion() -> DetectionFilter:
-    """Return the filter that keeps all boxes of a motion detector, whose score is no confidence."""
+    """Return a filter that keeps all boxes of a motion detector, because its score is no confidence."""
     return DetectionFilter(frozenset({"car"}), 0.0, 0.0)

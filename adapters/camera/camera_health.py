@@ -1,4 +1,4 @@
-"""Degradation of a camera: staged on clean images by family and level, and read from an image's quality."""
+"""Camera degradation: simulated on clean images by family and level, and estimated from images."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -18,9 +18,9 @@ from worldstate.ground.typing import Float32Array, FloatArray, ImageArray, IntAr
 Family = Literal["blur", "darkness", "noise", "all"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
 
-# d at which the table is measured: clean, then the four levels of each family.
+# Values of d at which the table is measured: clean, then the four levels of each family.
 LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)
-# Gaussian blur in pixels, factor on the brightness, noise in grey levels of 255.
+# Gaussian blur in pixels, factor on the brightness, noise in grey levels (of 255).
 STRENGTHS: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
         "blur": (0.0, 2.0, 4.0, 8.0, 16.0),
@@ -29,17 +29,18 @@ STRENGTHS: Mapping[str, tuple[float, ...]] = MappingProxyType(
     }
 )
 
-# Below, a neighbour's weight exp(-1 / 2 sigma^2) is less than half a grey level, and OpenCV finds no kernel.
+# Below this, a neighbour's weight exp(-1 / 2 sigma^2) is less than half a grey level, and OpenCV has no
+# kernel.
 _NO_BLUR_PX = 0.25
-# A blur of this many pixels leaves no detail that half the resolution would lose.
+# A blur of this many pixels leaves no detail that is lost at half the resolution.
 _WIDE_PX = 4.0
-# Number of quantiles of the staged noise, which ends at 4.3 sigma.
+# Number of quantiles of the simulated noise; the last one is at 4.3 sigma.
 QUANTILES = 1 << 16
 
 
 def strength(family: str, degradation: float) -> float:
-    """Return the strength of one of the three families at a degradation d in [0, 1]."""
-    # Linear between the levels, darkness in the logarithm.
+    """Return the strength of a family, except ``"all"``, at a degradation d in [0, 1]."""
+    # Linear between the levels; darkness is linear in the logarithm.
     level = in_range("degradation", degradation, 0.0, 1.0)
     knots = np.array(STRENGTHS[family])
     if family == "darkness":
@@ -48,17 +49,17 @@ def strength(family: str, degradation: float) -> float:
 
 
 def darkness_of(factor: float) -> float:
-    """Return the d in [0, 1] of a factor on the brightness; beyond the last level it is 1."""
+    """Return the d in [0, 1] of a factor on the brightness; 1 beyond the last level."""
     return float(np.interp(-np.log(max(factor, 1e-6)), -np.log(STRENGTHS["darkness"]), LEVELS))
 
 
 def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.random.Generator) -> ImageArray:
-    r"""Return a frame as a degraded camera would have taken it.
+    r"""Return a frame as a degraded camera would take it.
 
     .. math:: y = \mathrm{clip}(\mathrm{round}(a\,(G_\sigma * x) + n)), \qquad n \sim N(0, s^2)
 
-    with :math:`\sigma`, a and s those of the family at d; ``"all"`` takes the three together: optics first,
-    exposure next, the sensor last.
+    where :math:`\sigma`, a and s are those of the family at d. ``"all"`` applies the three in the order
+    optics, exposure, sensor.
 
     Shapes: frame (height, width).
     """
@@ -74,7 +75,7 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
 
 
 def blurred(frame: ImageArray, sigma_px: float, rng: np.random.Generator) -> ImageArray:
-    """Blur; a wide one on a reduced image, whose pixels are themselves a box of variance (f^2 - 1) / 12."""
+    """Blur; a wide blur acts on a reduced image, whose pixels are a box filter of variance (f^2 - 1) / 12."""
     cv2 = optional("cv2")
     if sigma_px < _NO_BLUR_PX:
         return frame
@@ -85,7 +86,8 @@ def blurred(frame: ImageArray, sigma_px: float, rng: np.random.Generator) -> Ima
     if factor > 1:
         frame = cv2.resize(frame, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
     left_px = np.sqrt(sigma_px**2 - (factor**2 - 1) / 12.0) / factor
-    # The border is mirrored in its pixel's middle, which in a reduced image lies nearer to the pixel's edge.
+    # The border is mirrored at the middle of its pixel, which in a reduced image is nearer to the pixel's
+    # edge.
     border = cv2.BORDER_REFLECT if factor > 1 else cv2.BORDER_REFLECT_101
     smooth: ImageArray = cv2.GaussianBlur(frame, (0, 0), left_px, borderType=border)
     return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR) if factor > 1 else smooth
@@ -96,7 +98,7 @@ def _darkened(frame: ImageArray, factor: float, rng: np.random.Generator) -> Ima
 
 
 def _noisy(frame: ImageArray, sigma: float, rng: np.random.Generator) -> ImageArray:
-    # Grey levels are whole, so the noise may be too: quantiles looked up, a third of the time of drawing it.
+    # Grey levels are integers, so integer noise suffices: table look-up takes a third of the time of drawing.
     drawn = rng.integers(0, QUANTILES, frame.shape, dtype=np.uint16)
     grey: NDArray[np.int16] = np.rint(sigma * normal_quantiles()).astype(np.int16).take(drawn)
     grey += frame
@@ -114,17 +116,18 @@ def normal_quantiles() -> Float32Array:
 _STAGES = {"blur": blurred, "darkness": _darkened, "noise": _noisy}
 
 
-# While an image is clean, every d at most `_CLEAN`, the brightness and sharpness of reference follow it with
-# a time constant, but never by more than a factor from the learned values: slow soiling must not become the
+# While an image is clean (every d at most `_CLEAN`), the reference brightness and sharpness follow it with
+# this time constant, but stay within a factor of the learned values, so that slow soiling does not become the
 # reference.
 _FOLLOW_S, _CLEAN, _MOST_DRIFT = 120.0, 0.15, 1.5
-# Side of the central part that is analysed, at full resolution: a reduced image would hide blur and noise.
+# Side of the analysed central part. It keeps the full resolution, because a reduced image would hide blur and
+# noise.
 LARGEST_PX = 640
 FINE_PX, COARSE_PX = 1.0, 4.0
 _SECOND_DIFFERENCE = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
 _GAIN = 6.0
 _MAD_TO_STD = 1.4826
-# Rounding to whole grey levels.
+# Variance from rounding to integer grey levels.
 _QUANTISATION = 1.0 / 12.0
 
 
@@ -134,13 +137,13 @@ class ImageQuality:
 
     brightness: float  # Mean grey level, 0 to 255
     noise: float  # Standard deviation of the pixel noise, grey levels
-    # Gradient energy at 1 px over that at 4 px, noise taken off: it does not depend on the brightness. None
-    # where the noise drowns it.
+    # Gradient energy at 1 px over that at 4 px, without noise; independent of the brightness. None if the
+    # noise is stronger.
     sharpness: float | None
 
 
 def image_quality(frame: ImageArray) -> ImageQuality:
-    r"""Measure a frame.
+    r"""Measure brightness, noise and sharpness of a frame.
 
     .. math:: \hat\sigma = 1.4826\, \mathrm{med} |D * x| / 6,
 
@@ -153,13 +156,12 @@ def image_quality(frame: ImageArray) -> ImageQuality:
     ----------
     Immerkaer, "Fast noise variance estimation", 1996.
     """
-    # The noise is that of the median absolute deviation of a second difference, in which smooth surfaces and
-    # straight edges cancel,
-    #
-    # and the sharpness compares two scales of the gradient, less what white noise adds to each,
+    # The noise is estimated by the median absolute deviation of a second difference, in which smooth surfaces
+    # and straight edges cancel. The sharpness compares the gradient at two scales, without the contribution
+    # of white noise to each.
     if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or min(frame.shape[:2]) < 16:
         raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
-    # Imported where it is needed: it takes as long as all else that a run without a camera imports.
+    # Imported here: it takes as long as all other imports of a run without a camera together.
     from scipy.ndimage import convolve
 
     grey = _central_grey(frame)
@@ -171,7 +173,7 @@ def image_quality(frame: ImageArray) -> ImageQuality:
 def _central_grey(frame: ImageArray) -> Float32Array:
     top, left = (max((side - LARGEST_PX) // 2, 0) for side in frame.shape[:2])
     centre = frame[top : top + LARGEST_PX, left : left + LARGEST_PX]
-    # One colour: an average over the three would hide part of the noise of each.
+    # One colour, because an average over the three would hide part of the noise.
     return np.asarray(centre if centre.ndim == 2 else centre[:, :, 1], dtype=np.float32)
 
 
@@ -182,7 +184,7 @@ def _sharpness(grey: Float32Array, noise: float) -> float | None:
 
 
 def _gradient_energy(grey: Float32Array, scale_px: float, noise: float) -> tuple[float, float]:
-    """Energy of the gradient without, and of, the noise."""
+    """Return the energy of the gradient without the noise, and that of the noise."""
     from scipy.ndimage import gaussian_filter, sobel
 
     smooth = gaussian_filter(grey, scale_px)
@@ -193,7 +195,7 @@ def _gradient_energy(grey: Float32Array, scale_px: float, noise: float) -> tuple
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Degradation of an image by family, each d in [0, 1] on the scale of `degradation.LEVELS`.
+    """Degradation of an image per family, each d in [0, 1] on the scale of `LEVELS`.
 
     Examples
     --------
@@ -208,11 +210,11 @@ class Health:
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth:
-    """Brightness, sharpness, noise of a camera's images, clean and at every staged level: the scale of d."""
+    """Brightness, sharpness and noise of a camera's images, clean and at each level: the scale of d."""
 
     brightness: float  # Mean grey level of clean images, > 0
-    sharpness: tuple[float, ...]  # At the five levels of blur, not rising
-    noise: tuple[float, ...]  # At the five levels of noise, not falling
+    sharpness: tuple[float, ...]  # At the five levels of blur, non-increasing
+    noise: tuple[float, ...]  # At the five levels of noise, non-decreasing
 
     def __post_init__(self) -> None:
         in_range("brightness", self.brightness, 0.0, 255.0, open_low=True)
@@ -224,8 +226,8 @@ class CameraHealth:
             raise InvalidArgumentError("expected a positive sharpness and a noise >= 0")
 
     def estimate(self, quality: ImageQuality) -> Health:
-        """Return d of each family."""
-        # Sharpness below the noise gives no estimate of blur; the noise is then the larger degradation.
+        """Return d per family."""
+        # If noise hides the sharpness, blur is not estimated; the noise is then the larger degradation.
         blur = 0.0
         if quality.sharpness is not None:
             blur = float(np.interp(-quality.sharpness, -np.array(self.sharpness), LEVELS))
@@ -245,9 +247,9 @@ def learn_health(clean: Iterable[ImageArray], rng: np.random.Generator) -> Camer
 
 
 def health_scale(brightness: FloatArray, sharpness: FloatArray, noise: FloatArray) -> CameraHealth:
-    """Return the scale from what clean images measure, and their copies at each level; NaN where drowned.
+    """Return the scale from measures of clean images and of their copies at each level.
 
-    Shapes: brightness (n,), sharpness and noise (n, levels).
+    Shapes: brightness (n,), sharpness and noise (n, levels). Sharpness is NaN if noise hides it.
     """
     if not brightness.size or np.isnan(sharpness).all(axis=0).any():
         raise InvalidArgumentError("clean: expected at least one image with a measurable sharpness")
@@ -259,14 +261,14 @@ def health_scale(brightness: FloatArray, sharpness: FloatArray, noise: FloatArra
 
 
 class HealthMonitor:
-    """Track a camera's degradation against a clean reference that follows the daylight."""
+    """Track a camera's degradation against a clean reference that adapts to the daylight."""
 
     def __init__(self, health: CameraHealth) -> None:
         self.reference = self._learned = health
         self._stamp_ns: int | None = None
 
     def update(self, stamp_ns: int, quality: ImageQuality) -> Health:
-        """Take the quality of the next image; return the degradation by family."""
+        """Process the quality of the next image; return the degradation per family."""
         seen = self.reference.estimate(quality)
         elapsed_s = 0.0 if self._stamp_ns is None else max(stamp_ns - self._stamp_ns, 0) / 1e9
         self._stamp_ns = stamp_ns
@@ -290,7 +292,7 @@ class HealthMonitor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DegradationLog:
-    """Degradation over time, as the function of the stamp that `VisionQuery` takes."""
+    """Degradation over time, as a function of the stamp for `VisionQuery`."""
 
     stamps_ns: IntArray  # shape (n,): Increasing
     degradation: FloatArray  # shape (n,): d in [0, 1]
@@ -301,6 +303,6 @@ class DegradationLog:
             raise InvalidArgumentError("degradation: expected numbers in [0, 1] at increasing time stamps")
 
     def __call__(self, stamp_ns: int) -> float:
-        """Return d at the last stamp at or before `stamp_ns`, the first one before that."""
+        """Return d at the last stamp up to `stamp_ns`; before the first stamp, the first d."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns, side="right")) - 1
         return float(self.degradation[max(index, 0)])

@@ -1,4 +1,4 @@
-"""Class names of detectors and data sets, mapped onto the road users that the library asks for."""
+"""Mapping of class names of detectors and data sets to the road users of the library."""
 
 import json
 import re
@@ -7,13 +7,13 @@ from functools import lru_cache
 from importlib.resources import files
 
 _TABLE = json.loads((files("worldstate") / "data" / "class_names.json").read_text("utf-8"))
-# The eighty names of COCO: YOLO text counts them from 0, COCO's numbers from 1 with ten left out.
+# The 80 names of COCO: YOLO numbers them from 0; COCO from 1, with ten numbers unused.
 YOLO_NAMES: tuple[str, ...] = tuple(_TABLE["coco"])
 COCO_CATEGORIES = dict(zip(sorted({*range(1, 91)} - {*_TABLE["numbers_left_out"]}), YOLO_NAMES, strict=True))
 ROAD_USERS = frozenset(_TABLE["classes"])
 _MOTOR_VEHICLES = ROAD_USERS - {"person", "bicycle"}
-# Numbers in the place of a name are Ultralytics'. Only those of motor vehicles are read: another data set may
-# mean a car by 0 or 1, and what is not known is no absence.
+# Ultralytics' numbers may replace names. Only those of motor vehicles are read: in another data set 0 or 1
+# may be a car, and an unknown class must not become an absence.
 _NUMBERED = {str(i): name for i, name in enumerate(YOLO_NAMES) if name in _MOTOR_VEHICLES}
 _KNOWN: Mapping[str, str] = (
     {name: name for name in (*YOLO_NAMES, *_TABLE["no_vehicle"])}
@@ -24,7 +24,7 @@ _KNOWN: Mapping[str, str] = (
 
 @lru_cache(maxsize=1024)
 def class_name(label: str) -> str:
-    """Return the class of a name in the library's words; one that no data set has in lower case.
+    """Return the library's class of a name; an unknown name is returned in lower case.
 
     Examples
     --------
@@ -37,10 +37,10 @@ def class_name(label: str) -> str:
 
 
 def may_be(name: str, asked: Collection[str]) -> bool:
-    """Tell whether a box of a class may be of one that is asked for.
+    """Return whether a box of a class may show one of the given classes.
 
-    A detector calls one van a car and another a truck: a motor vehicle may be any other. A class that no data
-    set has may be anything; a person or a traffic light is no car.
+    Detectors confuse motor vehicles (one van is a car, another a truck), so any motor vehicle may be any
+    other. An unknown class may be anything; a person or a traffic light is never a car.
 
     Examples
     --------

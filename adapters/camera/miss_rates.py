@@ -1,4 +1,4 @@
-"""Measured miss and clutter rates of a camera's detector, with their counts, on disk."""
+"""Measured miss and clutter rates of a camera's detector, with their counts, in a file."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass, field
@@ -15,9 +15,9 @@ from worldstate.ground.serialisation import ADDED, Layout, encode
 
 from .camera_health import LEVELS, CameraHealth, Health
 
-# Far more than there are kinds of degradation; a bound for files from elsewhere.
+# Far more than there are kinds of degradation; a limit for files of unknown origin.
 MOST_FAMILIES = 100
-# Jeffreys' prior of a rate: no cell is 0 or 1, which would make a look infallible.
+# Jeffreys' prior of a rate. It keeps every cell between 0 and 1, so that no look is infallible.
 PRIOR = 0.5
 
 Rows = tuple[tuple[float, ...], ...]
@@ -25,13 +25,13 @@ Rows = tuple[tuple[float, ...], ...]
 
 @dataclass(frozen=True, slots=True)
 class FamilyCounts:
-    """Counts of one family of degradations."""
+    """Counts for one family of degradations."""
 
-    # Number of reference objects, and of those not detected; rows are azimuth bins, columns levels of
-    # degradation.
+    # Number of reference objects, and number of those not detected; rows are azimuth bins, columns
+    # degradation levels.
     looks: Rows
     misses: Rows
-    # Query sectors without a reference object, and those of them with a false detection, at each level.
+    # Number of query sectors without a reference object, and of those with a false detection, per level.
     sectors: tuple[float, ...]
     clutter: tuple[float, ...]
 
@@ -44,13 +44,13 @@ class FamilyCounts:
             raise InvalidArgumentError("counts: expected 0 <= misses <= looks and 0 <= clutter <= sectors")
 
     def __add__(self, other: "FamilyCounts") -> "FamilyCounts":
-        """Return the counts of two sets of images."""
+        """Return the counts of two sets of images together."""
         mine, theirs = astuple(self), astuple(other)
         return FamilyCounts(*(as_tuples(np.add(a, b)) for a, b in zip(mine, theirs, strict=True)))
 
     def miss_rates(self, repeats: float = 1.0) -> FloatArray:
-        """Return beta, shape (bins, levels): posterior means, never falling with azimuth or degradation."""
-        # A cell without data has the prior mean of one half, as far as monotony allows.
+        """Return beta, shape (bins, levels): posterior means, non-decreasing in azimuth and degradation."""
+        # A cell without data has the prior mean of 0.5, as far as monotonicity allows.
         looks, misses = np.array(self.looks) / repeats, np.array(self.misses) / repeats
         weight = looks + 2.0 * PRIOR
         return isotonic_grid((misses + PRIOR) / weight, weight)
@@ -70,36 +70,36 @@ class FamilyCounts:
 
 
 def as_tuples(values: FloatArray) -> Any:
-    """Return counts as a table of misses holds them: numbers, or rows of numbers."""
+    """Return counts as nested tuples."""
     rows = values.tolist()
     return tuple(tuple(row) for row in rows) if values.ndim == 2 else tuple(rows)
 
 
 @dataclass(frozen=True)
 class MissRates:
-    r"""Miss and clutter rates of one detector behind one camera.
+    r"""Miss and clutter rates of one detector with one camera.
 
     .. math:: \hat\beta = \frac{m / r + 1/2}{n / r + 1}
 
-    with m misses of n looks and r repeats per cell, made monotone in azimuth and degradation.
+    with m misses in n looks and r repeats per cell, made monotone in azimuth and degradation.
 
     Parameters
     ----------
     azimuth_deg : tuple of float
         Edges of the azimuth bins off the optical axis, degrees, from 0 to the edge of the view.
     families : mapping of str to FamilyCounts
-        Looks and misses of each family of degradations.
+        Looks and misses per family of degradations.
     provenance : mapping of str to str
         Detector, data and version.
     health : CameraHealth, optional
-        Scale on which the degradation d of this camera is read from its images.
+        Scale for the degradation d of this camera's images.
     repeats : float
         Number r of successive images that carry the same information.
 
     Raises
     ------
     InvalidArgumentError
-        If bins and counts do not fit.
+        If bins and counts do not match.
 
     Examples
     --------
@@ -130,25 +130,25 @@ class MissRates:
 
     @cached_property
     def tables(self) -> dict[str, MissRateTable]:
-        """beta(theta, d) by family, constant from the middle of the last bin to its edge."""
+        """beta(theta, d) per family, constant from the middle of the last bin to its edge."""
         return {name: self._table(counts.miss_rates(self.repeats)) for name, counts in self.families.items()}
 
     @cached_property
     def table(self) -> MissRateTable:
-        """Largest beta over the families at every d: absence is then never overrated."""
+        """Largest beta over the families at every d, so that absence is never overrated."""
         rates = [counts.miss_rates(self.repeats) for counts in self.families.values()]
         return self._table(np.max(rates, axis=0))
 
     def level(self, health: Health) -> float:
         """Return the d at which `table` has, at boresight, the miss rate of the worst family.
 
-        A blur that hardly affects the detector is then no strong degradation. A family that was not measured
-        counts as the worst of those that were.
+        A blur that hardly affects the detector therefore gives a small d. For a family that was not measured,
+        the worst measured one is used.
 
         Parameters
         ----------
         health : Health
-            Degradation by family, each in [0, 1].
+            Degradation per family, each in [0, 1].
 
         Returns
         -------
@@ -157,7 +157,7 @@ class MissRates:
         """
         rates = [self.tables.get(name, self.table)(0.0, d) for name, d in asdict(health).items()]
         at_boresight = np.array([self.table(0.0, d) for d in LEVELS])
-        # Of several levels with the same rate the lowest: np.interp needs increasing abscissae.
+        # Use the lowest of several levels with the same rate: np.interp needs increasing abscissae.
         rising = np.concatenate([[True], np.diff(at_boresight) > 0.0])
         return float(np.interp(max(rates), at_boresight[rising], np.array(LEVELS)[rising]))
 
@@ -166,7 +166,7 @@ class MissRates:
         return max(float(np.interp(degradation, LEVELS, one.clutter_rates)) for one in self.families.values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values with the schema's name and version."""
+        """Return values for JSON with the schema's name and version."""
         return {**encode(self), "table": encode(self.table)}
 
     def _table(self, beta: FloatArray) -> MissRateTable:
@@ -177,14 +177,14 @@ class MissRates:
 
 
 def save_miss_rates(path: str | Path, rates: MissRates) -> None:
-    """Write miss rates to exactly this path, whole or not at all.
+    """Write miss rates to a file, atomically.
 
     Parameters
     ----------
     path : str or Path
-        Exactly this file.
+        File to write.
     rates : MissRates
-        As they were measured.
+        Rates to write.
 
     Raises
     ------
@@ -204,7 +204,7 @@ def save_miss_rates(path: str | Path, rates: MissRates) -> None:
 
 
 def load_miss_rates(path: str | Path) -> MissRates:
-    """Read what `save_miss_rates` wrote.
+    """Read a file written by `save_miss_rates`.
 
     Parameters
     ----------
@@ -214,14 +214,14 @@ def load_miss_rates(path: str | Path) -> MissRates:
     Returns
     -------
     MissRates
-        As they were measured.
+        The rates of the file.
 
     Raises
     ------
     InputFileError
-        If the file is missing, larger than 16 MiB, no JSON, or a number is missing or out of range.
+        If the file is missing, larger than 16 MiB or not JSON, or a number is missing or out of range.
     SchemaVersionError
-        If it is of another major version.
+        If the file has another major version.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""From image columns to azimuth in `base_link` and back."""
+"""Pinhole camera: conversion between image columns and azimuth in `base_link`."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -13,24 +13,24 @@ from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finit
 from worldstate.ground.serialisation import ADDED
 from worldstate.measurement.measurement import Sighting
 
-# What nanoseconds of 64 bits hold, and a yaw that counts on.
+# Largest offset in 64-bit nanoseconds, and largest yaw before wrapping.
 MOST_OFFSET_S, MOST_TURNS_RAD = 9e9, 1e6
 NOMINAL_RANGE_M = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
-    r"""A camera without distortion, looking along `yaw_rad`, beside the origin of `base_link`.
+    r"""A camera without distortion at `position_m` in `base_link` that looks along `yaw_rad`.
 
-    For something on the horizon in column u of a W pixels wide image, seen by a camera pitched up by p,
+    For an object on the horizon in column u of an image W pixels wide, taken with pitch p (up positive),
 
     .. math:: \tan a = \frac{\cos p \tan h \,(2 u_0 - 2u) / W + \sin p \sin r}{\cos r}
 
     is the azimuth a off the optical axis, left positive, with half angle of view h, the axis in column u_0
-    and roll r. The camera is not at the origin of `base_link`, where the array is: the azimuth there depends
-    on the range. It is computed at `nominal_range_m` from the camera, and what it would be wrong by at
-    another range is part of the standard deviation of a sighting. For OVAD's offset the shift is 1.5 to
-    1.8 deg at 30 deg and 10 m. The height only matters to the elevation, which is not used.
+    and roll r. The camera is not at the origin of `base_link`, so the azimuth there depends on the range. It
+    is computed at `nominal_range_m` from the camera; the error at other ranges is part of the standard
+    deviation of a sighting. For OVAD's offset the shift is 1.5 to 1.8 deg at 30 deg and 10 m. The height
+    changes only the elevation, which is not used.
 
     Parameters
     ----------
@@ -39,20 +39,20 @@ class PinholeCamera:
     half_angle_rad : float
         Half the horizontal angle of view, in (0, pi/2).
     principal_px : float, optional
-        Column of the optical axis; the middle of the image where not given.
+        Column of the optical axis; the middle of the image if not given.
     roll_rad : float
         Turn about the optical axis, in (-pi/2, pi/2); positive lifts the left side.
     stamp_offset_s : float
-        What brings the stamps of its images to the clock of the sound, seconds, of any size.
+        Added to the camera's stamps to obtain the clock of the sound, seconds.
     position_m : tuple of float
-        Of the camera in `base_link`, (x, y, z).
+        Camera position (x, y, z) in `base_link`.
     yaw_rad, pitch_rad : float
-        Direction of the optical axis: azimuth, left positive, wrapped into (-pi, pi] where it is beyond; and
-        elevation, up positive, in (-pi/2, pi/2).
+        Direction of the optical axis: azimuth, left positive, wrapped into (-pi, pi], and elevation, up
+        positive, in (-pi/2, pi/2).
     nominal_range_m : float
-        Distance from the camera at which azimuths are exact; larger than the offset.
+        Distance from the camera at which azimuths are exact; larger than the horizontal offset.
     range_spread : float
-        Standard deviation of the range relative to the nominal one.
+        Standard deviation of the range divided by the nominal range.
 
     Raises
     ------
@@ -98,7 +98,7 @@ class PinholeCamera:
 
     @classmethod
     def ovad(cls, **changes: Any) -> "PinholeCamera":
-        """Return the camera of OVAD by its published facts, but for what is given.
+        """Return the camera of OVAD by its published data, with the given changes.
 
         Half angle of view 0.6 rad, aspect 0.628, 0.567 m behind, 0.485 m below and 0.0316 m right of the
         array, pitched up by 0.11979 rad.
@@ -121,7 +121,7 @@ class PinholeCamera:
         Parameters
         ----------
         column_px : array_like
-            From 0 at the left edge to `width_px` at the right one, any shape.
+            From 0 at the left edge to `width_px` at the right edge, any shape.
 
         Returns
         -------
@@ -144,7 +144,7 @@ class PinholeCamera:
         Returns
         -------
         ndarray
-            Pixels; outside [0, width_px] beyond the edges, NaN beside and behind the camera.
+            Pixels: outside [0, width_px] beyond the edges, NaN at 90 deg or more off the axis.
         """
         off_axis = self.off_axis(azimuth_rad)
         ahead = np.where(np.abs(off_axis) < math.pi / 2, off_axis, np.nan)
@@ -152,26 +152,26 @@ class PinholeCamera:
         return np.asarray(0.5 * self.width_px * (self._middle - across))
 
     def off_axis(self, azimuth_rad: ArrayLike) -> FloatArray:
-        """Return the azimuth off the optical axis, at the camera, of an azimuth in `base_link`, (-pi, pi]."""
+        """Convert an azimuth in `base_link` to the azimuth off the optical axis at the camera, (-pi, pi]."""
         azimuth = np.asarray(azimuth_rad, dtype=np.float64)
         x, y, _ = self.position_m
         along = x * np.cos(azimuth) + y * np.sin(azimuth)
-        # Where the ray from the origin meets the circle of nominal range around the camera.
+        # Distance at which the ray from the origin meets the circle of nominal range around the camera.
         reach = along + np.sqrt(along**2 - x**2 - y**2 + self.nominal_range_m**2)
         seen = np.arctan2(reach * np.sin(azimuth) - y, reach * np.cos(azimuth) - x)
         return np.asarray(wrap_angle(np.asarray(seen - self.yaw_rad)))
 
     def sees(self, azimuth_rad: ArrayLike) -> BoolArray:
-        """Tell whether an azimuth in `base_link` lies between the edges of the image."""
+        """Return whether an azimuth in `base_link` is between the edges of the image."""
         left, right = np.arctan(self._tangent(np.array([0.0, self.width_px])))
         off_axis = self.off_axis(azimuth_rad)
         return np.asarray((right <= off_axis) & (off_axis <= left))
 
     def sighting(self, box_px: ArrayLike, label: str, score: float, *, moving: bool = True) -> Sighting:
-        r"""Turn a box into a sighting.
+        r"""Convert a box to a sighting.
 
-        The azimuth is that of its centre column. Its variance has two parts: the source of the sound may be
-        anywhere across the box, and its range is not known,
+        The azimuth is that of the box's centre column. Its variance has two parts: the sound source may be
+        anywhere across the box, and its range is unknown,
 
         .. math:: \sigma^2 = w^2 / 12 + (\rho\, \Delta)^2
 
@@ -182,9 +182,9 @@ class PinholeCamera:
         box_px : array_like
             Shape (4,): left, top, right, bottom.
         label, score
-            As the detector says.
+            Class and score from the detector.
         moving : bool
-            Whether it is not parked.
+            False for a parked object.
 
         Returns
         -------
@@ -194,7 +194,7 @@ class PinholeCamera:
         Raises
         ------
         InvalidArgumentError
-            If the box lies outside the image: it comes from another camera.
+            If the box is outside the image, which means that it comes from another camera.
 
         Examples
         --------
@@ -216,7 +216,7 @@ class PinholeCamera:
 
     @property
     def _middle(self) -> float:
-        """Column of the optical axis in half widths of the image; 1 in its middle."""
+        """Column of the optical axis in half widths of the image; 1 at the middle."""
         return 1.0 if self.principal_px is None else 2.0 * self.principal_px / self.width_px
 
     @property
@@ -237,10 +237,10 @@ def read_camera(path: str | Path) -> PinholeCamera:
     """Read a camera from JSON.
 
     ``{"width_px", "height_px", "horizontal_fov_deg", "position_m": [x, y, z]}``, the position in `base_link`,
-    metres, or, in place of the field of view, ``{"fx", "cx"}`` of a calibration without distortion, pixels;
-    optional are ``"yaw_deg"`` (left positive), ``"pitch_deg"`` (up positive), ``"roll_deg"`` (left side up)
-    and ``"stamp_offset_s"``, which brings the stamps of its images to the clock of the sound; all 0 where not
-    given.
+    metres. ``{"fx", "cx"}`` of a calibration without distortion, pixels, may replace the field of view.
+    Optional, with default 0, are ``"yaw_deg"`` (left positive), ``"pitch_deg"`` (up positive), ``"roll_deg"``
+    (left side up) and ``"stamp_offset_s"``, which is added to the camera's stamps to obtain the clock of the
+    sound.
 
     Parameters
     ----------
@@ -250,13 +250,13 @@ def read_camera(path: str | Path) -> PinholeCamera:
     Returns
     -------
     PinholeCamera
-        As the file says.
+        The camera of the file.
 
     Raises
     ------
     InputFileError
-        If the file is missing, too large, no JSON, has a key that means nothing here, or a number is missing
-        or out of range.
+        If the file is missing, too large or not JSON, has an unknown key, or a number is missing or out of
+        range.
 
     Examples
     --------
@@ -275,7 +275,7 @@ def read_camera(path: str | Path) -> PinholeCamera:
 
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
-    """What a camera file holds, and a car file of each camera."""
+    """Fields of a camera file, and of each camera in a car file."""
 
     width_px: int
     height_px: int
@@ -306,7 +306,7 @@ class CameraRecord:
             fx = in_range("camera.fx", self.fx, 0.0, math.inf, open_low=True)
             half_angle = math.atan2(0.5 * self.width_px, fx)
         if self.position_m is None:
-            problem = "expected where it stands in base_link, metres; [0, 0, 0] for one at the array"
+            problem = "expected its position in base_link, metres; [0, 0, 0] if it is at the array"
             raise InvalidArgumentError(f"camera.position_m: {problem}")
         return PinholeCamera(
             width_px=self.width_px,
@@ -321,11 +321,11 @@ class CameraRecord:
         )
 
     def _check_units(self) -> None:
-        """Refuse numbers by the names and in the units of the file."""
+        """Check numbers under the names and in the units of the file."""
         for name, low in (("horizontal_fov_deg", 0.0), ("pitch_deg", -90.0), ("roll_deg", -90.0)):
             if (given := getattr(self, name)) is not None:
                 in_range(f"camera.{name}", given, low, low + 180.0, open_low=True, open_high=True)
-        if self.yaw_deg is not None:  # which goes round
+        if self.yaw_deg is not None:  # is wrapped later
             most_deg = math.degrees(MOST_TURNS_RAD)
             in_range("camera.yaw_deg", self.yaw_deg, -most_deg, most_deg)
         if self.cx is not None:

@@ -1,4 +1,4 @@
-"""Frames of a video file, by OpenCV, which comes with the extra `vision`."""
+"""Frames of a video file, read with OpenCV (extra `vision`)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,24 +11,24 @@ from worldstate.ground.typing import ImageArray
 
 from .detections import MAX_FRAMES
 
-# OVAD's name for the video beside a recording's sound.
+# OVAD's file name of the video beside a recording's audio.
 VIDEO_NAME = "ueye_stereo_vid.mp4"
-# A bound on the memory of one decoded image: 200 MB.
+# Limits the memory of one decoded image to 200 MB.
 MAX_SIDE_PX = 8192
 
 
 @dataclass(frozen=True, slots=True)
 class Video:
-    """A video file that was opened once and found readable."""
+    """A video file that was readable when opened."""
 
     path: Path  # The file
     width_px: int  # Size of a frame
     height_px: int
     frame_rate_hz: float  # From the header of the file
-    count: int  # From the header, which may be wrong: `frames` yields what can be decoded
+    count: int  # From the header, which may be wrong; `frames` yields what can be decoded
 
     def frames(self) -> Iterator[ImageArray]:
-        """Yield frames of shape (height, width, 3), uint8, blue first, from the beginning."""
+        """Yield all frames, blue first, as uint8 of shape (height, width, 3)."""
         capture = _open(self.path)
         number = 0
         try:
@@ -43,7 +43,7 @@ class Video:
         finally:
             capture.release()
         if not number:
-            raise InputFileError(self.path, "expected a video, no frame of it can be decoded")
+            raise InputFileError(self.path, "expected a video, but no frame can be decoded")
 
 
 def open_video(path: str | Path) -> Video:
@@ -52,17 +52,17 @@ def open_video(path: str | Path) -> Video:
     Parameters
     ----------
     path : str or Path
-        Any container that OpenCV reads.
+        Any container format that OpenCV reads.
 
     Returns
     -------
     Video
-        With its frame rate and size.
+        The file with its frame rate and size.
 
     Raises
     ------
     InputFileError
-        If it is missing, no video, or its frames are larger than 8192 px.
+        If the file is missing or not a video, or its frames are larger than 8192 px.
     MissingExtraError
         If OpenCV is not installed.
 
@@ -91,9 +91,9 @@ def open_video(path: str | Path) -> Video:
 
 def _open(path: Path) -> Any:
     if not path.is_file():
-        raise InputFileError(path, "expected a video file, nothing is there")
+        raise InputFileError(path, "expected a video file, but it does not exist")
     capture = optional("cv2").VideoCapture(str(path))
     if not capture.isOpened():
         capture.release()
-        raise InputFileError(path, "expected a video file, it cannot be opened as one")
+        raise InputFileError(path, "expected a video file, but it cannot be opened")
     return capture

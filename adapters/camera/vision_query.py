@@ -29,30 +29,31 @@ from .detections import BORDER_PX, PARKED_S, DetectionFilter, DetectionFrame, De
 from .pinhole import PinholeCamera
 
 SENSOR = "camera"
-# Points at which a miss rate is averaged over the part of the sector that is in view.
-# The table is piecewise linear over tens of degrees: more points do not change the mean.
+# Number of points for the mean miss rate over the part of the sector in view. The table is piecewise linear
+# over tens of degrees, so more points do not change the mean.
 SAMPLES = 8
-# Trackers and boxes of whole objects reach beyond an image. Of the boxes of larger images a larger share than
-# this lies outside, or half of them reach beyond, some by more than this share of the width.
+# Trackers and boxes of whole objects may reach beyond an image. The image size is wrong if a larger share of
+# the boxes than the first is outside, or if half of them reach beyond it and one by more than the second
+# share of the width.
 _MOST_OUTSIDE, _FAR_BEYOND, _FEW_BOXES = 0.1, 0.01, 4
 _FEW_PX = 2.0
 _LOG = logging.getLogger(__name__)
-# A box that may be what is asked for and does not count: what is there was not read.
+# Used if a box of an expected class may be there but is rejected by the filter.
 _UNREAD = Unqueried("a box there does not count, by its class, score or size")
 NONE_COUNTS = "none of its boxes has counted yet, by class, score or size"
-# A vehicle that drives up is too small for some seconds: of a running camera a warning waits so long.
+# An approaching vehicle is too small for some seconds, so the warning for a live camera is delayed.
 _WARNED_AFTER_NS = nanoseconds(10.0)
-# Looks of a running camera that are remembered: whether a box stands still is asked over the last second, and
-# more than 60 images a second bring nothing to a decision every 0.1 s. So what comes sooner is left out.
+# Images kept of a live camera. The test for parked boxes uses the last second, and more than 60 images per
+# second do not improve a decision every 0.1 s, so faster images are skipped.
 REMEMBERED = 64
 LEAST_APART_NS = nanoseconds(PARKED_S / (REMEMBERED - 1))
-# Half the width of the sector around a bearing, and the probability that a moving object of the class is
-# reported where there is none, unless it was measured.
+# Half the width of the sector around a bearing, and the default probability of a false detection of a moving
+# object in it.
 _HALF_WIDTH_RAD, _CLUTTER_RATE = math.radians(10.0), 0.01
-MAX_IMAGE_AGE_S = 0.15  # At which an image is used: one and a half of OVAD's periods
-# Of a camera that runs, before its first image.
+MAX_IMAGE_AGE_S = 0.15  # Largest age of an image that is used: 1.5 times OVAD's period
+# Log of a live camera before its first image.
 NO_LOOKS = DetectionLog((), np.empty(0, dtype=np.int64), "the camera")
-# Ahead only: the front-end's default grid ends at 90 deg, and so do the views of the cameras asked.
+# Ahead only: the front-end's default grid ends at 90 deg, and so do the views of the cameras.
 WHOLE_SIDES: dict[Side | None, Sector] = {
     "left": Sector(math.pi / 4, math.pi / 4),
     "right": Sector(-math.pi / 4, math.pi / 4),
@@ -63,48 +64,50 @@ WHOLE_SIDES: dict[Side | None, Sector] = {
 class VisionQuery:
     r"""The camera as a co-evidence channel.
 
-    The result for a sector and the classes that the signature predicts is
+    The result for a sector and the classes predicted by the signature is
 
-    - `Unqueried` where there are no detections, no frame at that time, or nothing of the sector is in view;
-    - `Present` where a moving box of an expected class reaches into the sector;
-    - `Unqueried` where another moving box does, which the filter leaves out and may be of such a class;
+    - `Unqueried` if there are no detections, no frame at that time, or no part of the sector is in view;
+    - `Present` if a moving box of an expected class overlaps the sector;
+    - `Unqueried` if another moving box overlaps it that the filter rejects but that may be of such a class;
     - `Absent` otherwise.
 
-    Its miss rate is the expectation over the sector, with 1 where the camera does not see and the mean over
-    the expected classes C; a class that the filter leaves out is always missed,
+    Its miss rate is the expectation over the sector and the mean over the expected classes C. It is 1 outside
+    the field of view, and for a class that the filter rejects,
 
     .. math:: \beta = \frac{1}{|S|} \int_S \frac{1}{|C|} \sum_{c \in C} \beta_c(\theta, d)\, d\theta
 
-    with theta the angle off the optical axis. The image used is the latest one at or before the stamp.
+    with theta the angle off the optical axis. The latest image up to the stamp is used.
 
     Parameters
     ----------
     camera : PinholeCamera
         Camera that took the images.
     detections : DetectionLog or None
-        None if there are none, as for all moving-ego recordings: every result is `Unqueried`.
+        None if there are none, as for all OVAD recordings with a moving ego: every result is `Unqueried`.
     miss_rate : MissRateTable, optional
-        beta_c(theta, d); the values of the paper if none was measured.
+        beta_c(theta, d); by default the values of the paper.
     degradation : float or callable
         d in [0, 1], or a function from the stamp to d.
     keep : DetectionFilter, optional
         Classes, scores and sizes of the boxes that are used.
     line_of_sight : Sector, optional
-        Directions in line of sight, known from the occluders of the context; all if not given. A sound from
-        behind an occluder is that of a hidden source or its image in a wall; a visible source is in line of
-        sight, so that sector is searched.
+        Directions in line of sight, known from the occluders of the context; by default all. A visible source
+        is in line of sight; sound from behind an occluder comes from a hidden source or from its reflection
+        by a wall. Therefore this sector is searched.
     clutter : callable, optional
-        Measured probability of a false detection in the sector as a function of d; .01 if not given.
+        Measured probability of a false detection in the sector as a function of d; by default 0.01.
 
     Raises
     ------
     InputFileError
-        If more than a tenth of the boxes lies outside the image: they come from another camera.
+        If more than a tenth of the boxes is outside the image, which means that they come from another
+        camera.
 
     Attributes
     ----------
     beyond, outside : int
-        Boxes of a running camera that reached beyond the image, and those of them that were left out.
+        Number of a live camera's boxes that reached beyond the image, and of those outside, which were
+        dropped.
 
     Examples
     --------
@@ -138,7 +141,8 @@ class VisionQuery:
         self._asked = detections is not None
         self.beyond = self.outside = 0
         log = within_images(camera, NO_LOOKS if detections is None else detections)
-        # When the first image came with a box, with one that counts, and with one called else than a car.
+        # Stamps of the first image with a box, with a box that passes the filter, and with a class other than
+        # car.
         self._first_ns: dict[str, int] = {}
         self._noted: dict[str, Callable[[DetectionFrame], object]] = {
             "box": len,
@@ -161,7 +165,7 @@ class VisionQuery:
                 self._first_ns |= next(({name: ns} for ns, frame in stamped if holds(frame)), {})
 
     def _warn(self, stamp_ns: int) -> None:
-        """Warn once of a camera of which no box counts, some time after the first of them."""
+        """Warn once if no box of a camera passes the filter for some time after the first box."""
         due = stamp_ns - self._first_ns.get("box", stamp_ns) >= _WARNED_AFTER_NS
         if due and not self._warned and self._fault(stamp_ns):
             self._warned, log = True, self.detections
@@ -169,24 +173,24 @@ class VisionQuery:
             _LOG.warning("%s: %s; classes: %.200s", log.source, NONE_COUNTS, ", ".join(names))
 
     def go_on(self, before: "VisionQuery") -> None:
-        """Take over what another query of the same camera remembers: its last images and its labels."""
+        """Take over the last images and the labels of another query of the same camera."""
         self._asked, self._first_ns = before._asked, dict(before._first_ns)
         self._take(before.detections)
 
     def see(self, stamp_ns: int, frame: DetectionFrame) -> None:
-        """Take what a running detector found in an image; one less than 16 ms from another is left out.
+        """Store the detections of an image of a live camera; an image within 16 ms of another is skipped.
 
         Parameters
         ----------
         stamp_ns : int
-            When the image was taken by the stamps of the camera, nanoseconds.
+            Time of the image by the camera's clock, nanoseconds.
         frame : DetectionFrame
-            All of its boxes; those that reach beyond the image are cut at its border.
+            All of its boxes; boxes that reach beyond the image are cut at its border.
 
         Raises
         ------
         InputFileError
-            If all boxes lie outside the image: they come from another camera.
+            If all boxes are outside the image, which means that they come from another camera.
 
         Examples
         --------
@@ -202,7 +206,7 @@ class VisionQuery:
             raise InputFileError(before.source, _other_size(self.camera, frame))
         _check_pixels(before.source, found.boxes_px)
         self.beyond, self.outside = self.beyond + beyond, self.outside + len(frame) - len(found)
-        # A look that comes late is put in its place: one that is stamped ahead keeps no other out.
+        # A late image is inserted at its time, so an image with a stamp in the future does not block others.
         at = int(np.searchsorted(before.stamps_ns, taken_ns))
         if (np.abs(before.stamps_ns[max(at - 1, 0) : at + 1] - taken_ns) < LEAST_APART_NS).any():
             return
@@ -214,7 +218,7 @@ class VisionQuery:
         self._warn(taken_ns)
 
     def taken_ns(self, stamp_ns: int) -> int:
-        """Return when an image was taken, on the clock of the sound, from its stamp by the camera's clock."""
+        """Convert a stamp of the camera's clock to the clock of the sound."""
         return stamp_ns + nanoseconds(self.camera.stamp_offset_s)
 
     def ask(
@@ -231,12 +235,12 @@ class VisionQuery:
         stamp_ns : int
             Time on the clock of the stream, nanoseconds.
         bearing : Bearing or NotUsable
-            Centre of the sector, unless `side` is given; without either everything ahead is searched.
+            Centre of the sector, unless `side` is given; without either, everything ahead is searched.
         expected_labels : collection of str, optional
-            Classes that the signature predicts; all that the filter keeps if not given, or as long as the
-            detector has called every box a car.
+            Classes predicted by the signature. All classes of the filter are used if not given, or as long as
+            the detector has labelled every box as a car.
         side : {"left", "right"}, optional
-            Search that whole side, 0 to 90 deg, for a source whose bearing is coarse.
+            Search this whole side, 0 to 90 deg, for a source whose bearing is coarse.
 
         Returns
         -------
@@ -266,13 +270,14 @@ class VisionQuery:
         if any(sector.touches(one.azimuth_rad, one.width_rad) for one in moving):
             return Present(beta, clutter)
         unread = self._unread(stamp_ns, labels)
-        # Boxes none of which has counted yet may be of images of another size: where they are is not known.
+        # If no box has passed the filter yet, the boxes may be of images of another size, so their azimuths
+        # are unknown.
         if any(self._fault(stamp_ns) or sector.touches(one.azimuth_rad, one.width_rad) for one in unread):
             return _UNREAD
         return Absent(beta, clutter)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
-        """Return the boxes that the filter keeps in the image at `stamp_ns`, parked ones included.
+        """Return the boxes that the filter keeps in the image at `stamp_ns`, including parked ones.
 
         Parameters
         ----------
@@ -282,7 +287,7 @@ class VisionQuery:
         Returns
         -------
         tuple of Sighting
-            Empty without an image at that time.
+            Empty if there is no image at that time.
 
         Examples
         --------
@@ -292,7 +297,7 @@ class VisionQuery:
         return self._read(stamp_ns)[1]
 
     def last_look(self, stamp_ns: int) -> Look | None:
-        """Return what the whole image at `stamp_ns` says: whether anything that moves is in view.
+        """Return the result for the whole image at `stamp_ns`: whether a moving object is in view.
 
         Parameters
         ----------
@@ -302,7 +307,7 @@ class VisionQuery:
         Returns
         -------
         Look or None
-            With the time at which the image was taken; None without one.
+            The result with the time of the image; None without an image.
 
         Examples
         --------
@@ -316,7 +321,7 @@ class VisionQuery:
         moving = any(sighting.moving for sighting in self.sightings(stamp_ns))
         answer: CoEvidence = (Present if moving else Absent)(beta, self._clutter(self._degradation(stamp_ns)))
         taken_ns = int(self.detections.stamps_ns[frame])
-        # One answer is for the whole view: beside a box that is not read, nothing else is missed in it.
+        # The result is for the whole view: a rejected box makes it unqueried, not absent.
         if self._unread(stamp_ns, self.keep.labels):
             answer = _UNREAD
         return Look(SENSOR, taken_ns, answer, fault=self._fault(taken_ns))
@@ -325,16 +330,16 @@ class VisionQuery:
         return self.detections.latest(stamp_ns, nanoseconds(MAX_IMAGE_AGE_S))
 
     def _fault(self, stamp_ns: int) -> str | None:
-        """Return what is wrong with a camera until the first of its boxes counts."""
+        """Return the fault of a camera before the first of its boxes passes the filter."""
         first, counted = (self._first_ns.get(name, sys.maxsize) for name in ("box", "counted"))
         return NONE_COUNTS if first <= stamp_ns < counted else None
 
     def _unread(self, stamp_ns: int, labels: Collection[str]) -> list[Sighting]:
-        """Return the moving boxes that the filter leaves out and that may be of one of these classes."""
+        """Return the moving boxes that the filter rejects and that may be of one of these classes."""
         return [one for one in self._read(stamp_ns)[2] if may_be(one.label, labels)]
 
     def _read(self, stamp_ns: int) -> tuple[int, tuple[Sighting, ...], tuple[Sighting, ...]]:
-        """Return the number of the image at a time, the boxes that count, and the moving ones left out."""
+        """Return the number of the image at a time, the kept boxes and the moving rejected boxes."""
         frame = self._frame(stamp_ns)
         if frame is None:
             return -1, (), ()
@@ -354,13 +359,13 @@ class VisionQuery:
         )
 
     def miss_rate_over(self, sector: Sector, stamp_ns: int, labels: Collection[str] | None) -> float:
-        """Return the expected miss rate in a sector, 1 where nothing of it is in view."""
+        """Return the expected miss rate in a sector; 1 if no part of it is in view."""
         asked = self._asked_for(labels, stamp_ns)
         beta = self._expected_miss_rate(sector, self._degradation(stamp_ns), asked)
         return 1.0 if beta is None else beta
 
     def _asked_for(self, expected: Collection[str] | None, stamp_ns: int) -> Collection[str]:
-        # Background subtraction always does: asked for a truck it would not find one.
+        # Background subtraction always labels boxes as cars: a search for a truck would find none.
         calls_all_cars = stamp_ns < self._first_ns.get("other", sys.maxsize)
         if expected is None or (expected and calls_all_cars):
             return self.keep.labels
@@ -377,7 +382,7 @@ class VisionQuery:
         return sector.overlap(self._line_of_sight) or self._line_of_sight
 
     def _expected_miss_rate(self, sector: Sector, d: float, labels: Collection[str]) -> float | None:
-        """Return beta over the sector, None where nothing of it is in view."""
+        """Return beta over the sector; None if no part of it is in view."""
         in_view = sector.overlap(self.view)
         if in_view is None:
             return None
@@ -390,9 +395,9 @@ class VisionQuery:
 
 
 def _most_likely(frame: DetectionFrame, keep: DetectionFilter) -> DetectionFrame:
-    """Return an image with at most `MOST_BOXES`: those that count first, and of these the highest scores.
+    """Return an image with at most `MOST_BOXES` boxes: those that the filter keeps first, then by score.
 
-    Whether a box stands still is asked of all pairs with those of a second: 1,000 an image took 1 s a hop.
+    The test for parked boxes compares all pairs within a second: 1,000 boxes per image took 1 s per hop.
     """
     if len(frame) <= MOST_BOXES:
         return frame
@@ -404,9 +409,9 @@ def _most_likely(frame: DetectionFrame, keep: DetectionFilter) -> DetectionFrame
 
 
 def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
-    """Return a log with its boxes cut at the border of the images; those outside are left out and counted.
+    """Return a log with its boxes cut at the image border; boxes outside are dropped with a warning.
 
-    An image of which all boxes lie outside counts as not looked at.
+    An image of which all boxes are outside is removed.
     """
     boxes_px = np.concatenate([np.empty((0, 4)), *(frame.boxes_px for frame in log.frames)])
     by_px = np.abs(boxes_px - np.clip(boxes_px, 0.0, np.tile(_size_px(camera), 2))).max(axis=1, initial=0.0)
@@ -426,9 +431,9 @@ def within_images(camera: PinholeCamera, log: DetectionLog) -> DetectionLog:
 
 
 def _check_pixels(source: str, boxes_px: FloatArray) -> None:
-    """Refuse boxes all of which lie within the first two pixels: they are in parts of the image."""
+    """Refuse boxes that are all within the first two pixels: they are given as fractions of the image."""
     if 0.0 < boxes_px.max(initial=0.0) <= _FEW_PX:  # detectors reach a little beyond 1
-        problem = "expected boxes in pixels, got parts of the image (0 to 1)"
+        problem = "expected boxes in pixels, got fractions of the image (0 to 1)"
         raise InputFileError(source, f"{problem}: multiply them by its width and height")
 
 
@@ -437,36 +442,37 @@ def _size_px(camera: PinholeCamera) -> tuple[int, int]:
 
 
 def _other_size(camera: PinholeCamera, frame: DetectionFrame) -> str:
-    """Return what is wrong with boxes beyond the images of a camera."""
+    """Return the error message for boxes beyond the images of a camera."""
     corners = frame.boxes_px.reshape(-1, 2)
     x, y = corners[np.maximum(corners - _size_px(camera), -corners).max(axis=1).argmax()]
     image = f"the camera's {camera.width_px} x {camera.height_px} px"
     return f"expected boxes within {image}, got a corner at ({x:g}, {y:g})"
 
 
-_NARROWEST_RAD = 1e-9  # Of a part of a sector: thinner ones are rounding
+_NARROWEST_RAD = 1e-9  # Narrower parts of a sector are rounding errors
 
 
 class SeveralCameras:
-    r"""The cameras of a vehicle, asked together.
+    r"""The cameras of a vehicle, combined.
 
-    The sector of a sound is cut where a view begins or ends. Of a part P that the cameras c(P) see, and that
-    is s(P) of the sector, all of them miss a vehicle with
+    The sector of a sound is cut at the borders of the views. If the part P has the share s(P) of the sector
+    and is in view of the cameras c(P), all of them miss a vehicle with
 
     .. math:: \beta = \sum_P s(P) \prod_{i \in c(P)} \beta_i(P)
 
-    which is s(P) where none looks. Given where the vehicle is, cameras are taken to miss it independently:
-    what blinds all at once, as rain does, has to stand in the miss rate of each, through its degradation.
+    which contributes s(P) for a part in view of no camera. Given the position of the vehicle, misses of the
+    cameras are independent. A common cause such as rain must be part of each camera's miss rate, through its
+    degradation.
 
     Parameters
     ----------
     cameras : mapping of str to VisionQuery
-        By name.
+        Cameras by name.
 
     Raises
     ------
     InvalidArgumentError
-        Without a camera.
+        If there is no camera.
 
     Examples
     --------
@@ -484,7 +490,7 @@ class SeveralCameras:
 
     def __init__(self, cameras: Mapping[str, VisionQuery]) -> None:
         if not cameras:
-            raise InvalidArgumentError("cameras: expected one at least, got none")
+            raise InvalidArgumentError("cameras: expected at least one, got none")
         self.cameras = dict(cameras)
 
     def ask(
@@ -494,12 +500,12 @@ class SeveralCameras:
         expected_labels: Collection[str] | None = None,
         side: Side | None = None,
     ) -> CoEvidence:
-        """Return what all cameras together say of a sector; parameters are those of `VisionQuery.ask`."""
+        """Return the combined result of all cameras for a sector; parameters as in `VisionQuery.ask`."""
         every = list(self.cameras.values())
         said = [(one, one.ask(stamp_ns, bearing, expected_labels, side)) for one in every]
         told = [(one, answer) for one, answer in said if not isinstance(answer, Unqueried)]
         if len(told) < 2:
-            # The answer of the only camera that sees any of it stands as it is.
+            # With only one camera in view, its result is returned unchanged.
             return (told or said)[0][1]
         sector, asked = every[0].sector(bearing, side), [one for one, _ in told]
         labels = expected_labels
@@ -512,7 +518,7 @@ class SeveralCameras:
         return (Present if found else Absent)(min(miss, 1.0), clutter)
 
     def looks(self, stamp_ns: int) -> tuple[CameraLook, ...]:
-        """Return the image of every camera that has one at this instant, searched in its own view."""
+        """Return the look of every camera with an image at this time, over the camera's own view."""
         return tuple(
             CameraLook(replace(look, sensor=name, sector_rad=one.camera.view_rad), one.sightings(stamp_ns))
             for name, one in self.cameras.items()
@@ -520,16 +526,16 @@ class SeveralCameras:
         )
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
-        """Return the boxes of the first camera that has an image; `looks` has those of all."""
+        """Return the boxes of the first camera with an image; `looks` returns those of all."""
         return next((one.sightings for one in self.looks(stamp_ns)), ())
 
     def last_look(self, stamp_ns: int) -> Look | None:
-        """Return the look of the first camera that has an image, None without one."""
+        """Return the look of the first camera with an image; None without one."""
         return next((one.look for one in self.looks(stamp_ns)), None)
 
 
 def _parts(sector: Sector, views: Sequence[Sector]) -> list[tuple[float, Sector]]:
-    """Return the parts of a sector between which no view begins or ends, with the share of each."""
+    """Cut a sector at the borders of all views; return the parts with their shares."""
     half = sector.half_width_rad
     ends = {-half, half}
     for view in views:
