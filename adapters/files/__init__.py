@@ -1,1 +1,1 @@
-"""Arrays, models, checkpoints and tables on disk."""
+"""Arrays, models, checkpoints and tables in files."""

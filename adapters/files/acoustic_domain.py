@@ -1,4 +1,4 @@
-"""Hold an array and a sample rate against what a model was made for."""
+"""Comparison of an array and a sample rate with the domain of a model."""
 
 import hashlib
 import logging
@@ -23,7 +23,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: Sequence[str]) -> ModelDomain:
-    """Return the domain of windows that an array heard at these rates, the ego as the environments say."""
+    """Return the domain of windows of an array at these sample rates and environments."""
     heard = map(published.feature_rate_hz, rates_hz)
     alike = [_rate_of_long_frames(rate, published.feature_nfft(rate)) for rate in heard]
     low, high = (1.0 - published.RATE_TOLERANCE) * min(alike), (1.0 + published.RATE_TOLERANCE) * max(alike)
@@ -33,23 +33,23 @@ def domain_of(array: MicrophoneArray, rates_hz: Sequence[float], environments: S
 
 
 def ego_motion_of(environments: Sequence[str]) -> EgoMotion:
-    """Return what the ego did at environments D.. (moving) and any others (standing)."""
+    """Return the ego motion of environments: those named D.. are moving, others standing."""
     moved = {environment[:1] == "D" for environment in environments}
     return "any" if len(moved) > 1 else "moving" if True in moved else "standing"
 
 
 def ovad_domain(environments: Sequence[str]) -> ModelDomain:
-    """Return the domain of the windows released with OVAD."""
+    """Return the domain of the windows published with OVAD."""
     return domain_of(ovad_array(), [published.FEATURE_RATE_HZ], environments)
 
 
 def check_array(domain: ModelDomain, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
-    """Return the channels of an array in the order that a model was made with.
+    """Return the channels of an array in the order of the model.
 
     Raises
     ------
     OutOfDomainError
-        If the microphones stand elsewhere; the message names the array, the difference and the way out.
+        If the positions differ; the message contains the array, the difference and a remedy.
     """
     return matched_order(array_of(domain), array, way_out)
 
@@ -60,14 +60,14 @@ def array_of(domain: ModelDomain) -> MicrophoneArray:
 
 
 def heard_with(domain: ModelDomain) -> str:
-    """Return what tells features of one array, band and kind from those of others."""
+    """Return a text that distinguishes features of one array, band and version from others."""
     places = np.round(domain.positions_m, 3) + 0.0  # No minus zero
     told = hashlib.sha256(places.astype("<f8").tobytes()).hexdigest()[:12]
     return f"{domain.array}, {told}, {_feature(domain.feature, domain.band_hz)}"
 
 
 def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> bool:
-    """Return whether a model's thresholds hold for an array and the ego's motion; a word where not.
+    """Return whether a model's thresholds hold for an array and the ego's motion; warn if not.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> boo
     """
     domain = model.domain
     if domain is None:
-        _LOG.warning("the model names no array that it was made for: no budget is stated")
+        _LOG.warning("the model does not name its array: no budget is guaranteed")
         return False
     check_array(domain, array, WAY_OUT)
     if domain.ego_motion == ("standing" if moving_ego else "moving"):
@@ -89,7 +89,7 @@ def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> boo
 
 
 def outside_of(domain: ModelDomain | None, speed_mps: float) -> str | None:
-    """Return why a model reads nothing at a speed of the ego; None if it does, or if no speed is stated."""
+    """Return why a model is not used at an ego speed; None if it is used, or has no known domain."""
     if domain is None or abs(speed_mps) <= STANDING_MPS:
         return None
     if domain.ego_motion == "standing":
@@ -105,20 +105,20 @@ def feature_order(
     settings: FrontEndSettings,
     way_out: str = WAY_OUT,
 ) -> tuple[int, ...] | None:
-    """Return the channels in the model's order where it is another one, or refuse what it was not made for.
+    """Return the channels in the model's order if it differs; refuse data outside the model's domain.
 
     Raises
     ------
     OutOfDomainError
-        If array, sample rate, band or feature is not what the model was made with.
+        If array, sample rate, band or feature differs from that of the model.
     """
     low, high = domain.sample_rate_hz
     if sample_rate_hz < published.LEAST_RATE_HZ:
-        advice = "record at 8 kHz or more: what the model reads up to 2.7 kHz is not in this sound"
+        advice = "record at 8 kHz or more: this sound lacks part of the model's band up to 2.7 kHz"
         raise OutOfDomainError(f"sample rate: expected at least 6000 Hz, got {sample_rate_hz:g} Hz: {advice}")
     rate, nfft = settings.heard_rate_hz or sample_rate_hz, settings.nfft
     if not low <= _rate_of_long_frames(rate, nfft) <= high:
-        expected = f"those of the model, {published.FEATURE_NFFT} samples at {low:.0f} to {high:.0f} Hz"
+        expected = f"frames as in the model, {published.FEATURE_NFFT} samples at {low:.0f} to {high:.0f} Hz"
         raise OutOfDomainError(f"frames: expected {expected}, got {nfft} at {rate:g} Hz. {way_out}")
     made_with = _feature(domain.feature, domain.band_hz)
     got = _feature(published.FEATURE_VERSION, published.FEATURE_BAND_HZ)
@@ -136,18 +136,18 @@ def _feature(version: str, band_hz: tuple[float, float]) -> str:
 
 
 def _rate_of_long_frames(sample_rate_hz: float, nfft: int) -> float:
-    """Rate at which 512 samples last as long as a frame: ``512 f_s / N``."""
-    # What the feature depends on: a model hears sound of 6 kHz in frames of 64 as it hears that of 48 kHz.
+    """Return the rate at which 512 samples last as long as a frame: ``512 f_s / N``."""
+    # The feature depends only on this rate: frames of 64 samples at 6 kHz are equivalent to 512 at 48 kHz.
     return sample_rate_hz * published.FEATURE_NFFT / nfft
 
 
 def check_tables(model: ModelDomain, table: ModelDomain) -> None:
-    """Refuse windows of another array or feature than the model's; their channels cannot be put in order.
+    """Refuse windows of another array or feature than the model's, or with another channel order.
 
     Raises
     ------
     OutOfDomainError
-        If array, order, band or feature differ.
+        If array, order, band or feature differs.
     """
     order = check_array(model, array_of(table))
     if (np.diff(order) != 1).any():

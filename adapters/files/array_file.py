@@ -1,4 +1,4 @@
-"""Microphone positions: files of Acoular XML, CSV, JSON and ODAS, and boards that are known by name."""
+"""Microphone positions from files (Acoular XML, CSV, JSON, ODAS) and of boards known by name."""
 
 import csv
 import json
@@ -31,12 +31,12 @@ DATA = Path(str(files("worldstate"))) / "data"
 MODELS, PACKED = DATA / "models", ".json.gz"  # Beside the two models of the roof array
 
 Axes = Literal["acoular", "base_link"]
-# The coordinates x, y and z of a microphone as a file has them.
+# The coordinates x, y and z of a microphone, before conversion to numbers.
 Row: TypeAlias = Sequence[object]
 
 MAX_BYTES = 1 << 20
-# No vehicle carries a wider array, or one with its microphones farther apart or closer together: such a file
-# was written in millimetres, centimetres or kilometres.
+# No vehicle carries an array that is wider, or whose microphones are farther apart or closer together. Such a
+# file is in millimetres, centimetres or kilometres.
 MAX_APERTURE_M = 20.0
 MAX_SPACING_M, FAR_APART_M = 3.0, 1.0
 MIN_SPACING_M = 1e-3
@@ -46,7 +46,7 @@ _HEADER = re.compile(r"(?:pos(?:ition)?[ _]?)?([xyz])(?:[ _]*[\[(]?(mm|cm|m)[\])
 _TRANSPOSED = "three rows are a 3 x M matrix, as of MATLAB and pyroomacoustics: write its transpose"
 _MATRIX = "numpy.savetxt and MATLAB's writematrix write CSV of an M x 3 matrix"
 _DECIMAL_COMMAS = re.compile(r"(-?\d*,\d+|-?\d+)([;\s]+(-?\d*,\d+|-?\d+)){2,3}")
-# Of libconfig: strings stay, comments go; what does not end goes on to the end of the file.
+# Comments of libconfig are removed and strings kept; an unterminated one extends to the end of the file.
 _COMMENT = re.compile(r'("(?:\\.|[^"\\])*"?)|#[^\n]*|//[^\n]*|/\*(?:.*?\*/|.*)', re.DOTALL)
 _MICS, _GROUPS = (
     re.compile(r"\bmics\s*[:=]\s*[(\[](?=[\s,]*[{@])"),
@@ -56,7 +56,7 @@ _MU, _MAP = (re.compile(rf"\b{key}\s*[:=]\s*[(\[]([^()\[\]]*)[)\]]") for key in 
 
 
 class _Rows(NamedTuple):
-    """What a file holds, before its numbers are read."""
+    """Content of a file, before its numbers are read."""
 
     rows: list[Row]
     axes: str = "base_link"
@@ -65,41 +65,43 @@ class _Rows(NamedTuple):
 
 
 def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
-    r"""Read microphone positions in metres, one microphone a channel, in the order of the channels.
+    r"""Read microphone positions in metres, one microphone per channel, in the order of the channels.
 
-    Four forms are told apart by what they begin with:
+    The start of the file determines its format:
 
     - Acoular XML, ``<MicArray><pos Name="1" x="0.1" y="0" z="0" /> ...``, in the axes of the array plane: x
       to the right, y up, z along the look direction, so that :math:`(x, y, z)_{base} = (z, -x, y)_{file}`.
-    - CSV, one microphone a line: x, y, z, with or without a header and a column of names; separated by comma,
-      semicolon, tab or blanks. In `base_link` axes: x forward, y left, z up. A header may state another unit:
-      ``x_mm,y_mm,z_mm``.
+    - CSV with x, y, z of one microphone per line, with or without a header and a column of names; separated
+      by comma, semicolon, tab or spaces. The axes are those of `base_link`: x forward, y left, z up. A header
+      may give another unit: ``x_mm,y_mm,z_mm``.
     - JSON, ``[[x, y, z], ...]`` or ``{"positions_m": [[x, y, z], ...], "axes": "base_link"}``, in `base_link`
-      axes unless ``"axes"`` is ``"acoular"``; with ``"channels": [2, 3, ...]``, from 1, where the card has
-      more channels than microphones; ``"positions_mm"`` and ``"positions_cm"`` in other units.
-    - A configuration of ODAS: ``mics = ( { mu = ( x, y, z ); ... }, ... );``, in `base_link` axes, and
-      ``map: (2, 3, ...)`` as the channels.
+      axes unless ``"axes"`` is ``"acoular"``. ``"channels": [2, 3, ...]``, counted from 1, selects the
+      channels if the sound card has more channels than microphones. ``"positions_mm"`` and ``"positions_cm"``
+      use other units.
+    - ODAS configuration: ``mics = ( { mu = ( x, y, z ); ... }, ... );``, in `base_link` axes, with ``map: (2,
+      3, ...)`` as the channels.
 
-    Where no such file is, its name may be one of `named_arrays`.
+    If no such file exists, the name may be one of `named_arrays`.
 
     Parameters
     ----------
     path : str or Path
         The file, at most 1 MiB and 1024 microphones, or the name of an array.
     axes : {"acoular", "base_link"}, optional
-        The axes that the numbers are in, where they are not those of the form; none with a name.
+        Axes of the numbers if they differ from those of the format; not allowed with a name.
 
     Returns
     -------
     MicrophoneArray
-        Positions of shape (M, 3), metres, x forward, y left, z up.
+        Positions of shape (M, 3) in metres: x forward, y left, z up.
 
     Raises
     ------
     InputFileError
-        If the file is missing, too large or none of the four, has a document type or entities, holds fewer
-        than two microphones or two in one place, a coordinate is missing or not finite, the array cannot be
-        one in metres, or has no horizontal extent: a vertical line hears every azimuth alike.
+        If the file is missing, too large or in none of the four formats; contains a document type or
+        entities; has fewer than two microphones, or two at the same place; a coordinate is missing or not
+        finite; the array cannot be in metres; or it has no horizontal extent, so that a vertical line cannot
+        resolve azimuth.
 
     Examples
     --------
@@ -114,9 +116,9 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     """
     name = Path(path)
     known = named_arrays()
-    if name.name in known and not name.exists():  # also beside a car file, which names files so
+    if name.name in known and not name.exists():  # also if a car file gives the name as a path
         if axes is not None:
-            # Acoular's axes are left-handed: a flat board in them would be its mirror image.
+            # Acoular's axes are left-handed, so a flat board in them would be its mirror image.
             raise InputFileError(name, f"expected no axes with the name of an array, got {axes}")
         board = known[name.name]
         return MicrophoneArray(board["positions_m"], name.name, tuple(board.get("channels", ())))
@@ -129,7 +131,7 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
 
 
 def _held(path: Path, data: bytes) -> _Rows:
-    """Return what a file of any form holds."""
+    """Return the content of a file of any format."""
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
     if start == b"<":
         return _Rows(_xml_rows(path, data), "acoular")
@@ -143,13 +145,13 @@ def _held(path: Path, data: bytes) -> _Rows:
     plain = _COMMENT.sub(lambda found: found[1] or "", text)
     mics = _MICS.search(plain)
     if "@include" in plain[0 if mics is None else mics.end() :]:
-        raise InputFileError(path, "expected one file: write what @include names in its place")
+        raise InputFileError(path, "expected one file: replace @include by the content of that file")
     return _csv_rows(path, text) if mics is None else _odas_rows(path, plain, mics.end())
 
 
 @cache
 def named_arrays() -> dict[str, dict[str, Any]]:
-    """Return the boards that are known by name: as in JSON files, and the ``"source"``.
+    """Return the boards known by name, each as in a JSON file with its ``"source"``.
 
     Examples
     --------
@@ -162,14 +164,14 @@ def named_arrays() -> dict[str, dict[str, Any]]:
 
 
 def shipped_models() -> list[str]:
-    """Return the names of the models that ship beside the two of the roof array."""
+    """Return the names of the models that ship in addition to the two for the roof array."""
     return sorted(one.name.removesuffix(PACKED) for one in MODELS.glob(f"*{PACKED}"))
 
 
 def file_of_model(
     path: str | Path | None = None, array: MicrophoneArray | None = None, *, moving_ego: bool = False
 ) -> Path:
-    """Return the file that `read_model` reads with these arguments."""
+    """Return the file that `read_model` reads for these arguments."""
     named = shipped_models()
     if path is not None and (str(path) not in named or Path(path).exists()):
         return Path(path)
@@ -183,12 +185,12 @@ def file_of_model(
 
 
 def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array") -> None:
-    """Write an array as Acoular XML, whole or not at all; `read_array` gives the same numbers back.
+    """Write an array as Acoular XML, atomically; `read_array` returns the same numbers.
 
     Parameters
     ----------
     path : str or Path
-        Where to write.
+        File to write.
     array : MicrophoneArray
         Positions in `base_link` axes.
     name : str
@@ -220,7 +222,7 @@ def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array
 
 
 def array_csv(array: MicrophoneArray) -> str:
-    r"""Return an array as CSV in `base_link` axes, metres, which `read_array` reads.
+    r"""Return an array as CSV in `base_link` axes and metres, as `read_array` reads it.
 
     Examples
     --------
@@ -234,7 +236,7 @@ def array_csv(array: MicrophoneArray) -> str:
 def checked_array(
     path: Path, in_file: Sequence[Sequence[float]], axes: str, channels: tuple[int, ...] = ()
 ) -> MicrophoneArray:
-    """Check the positions that a file held, and turn them into `base_link` axes."""
+    """Check the positions of a file, and convert them to `base_link` axes."""
     if axes not in get_args(Axes):
         raise InputFileError(path, f"axes: expected {' or '.join(get_args(Axes))}, got {axes!r:.40}")
     if not 2 <= len(in_file) <= MAX_MICROPHONES:
@@ -253,14 +255,15 @@ def _check_size(path: Path, positions_m: FloatArray) -> None:
     extent_m, spacings_m = np.ptp(positions_m, axis=0), nearest_spacings_m(positions_m)
     wide_m, mean_m, least_m = float(extent_m.max()), spacings_m.mean(), spacings_m.min()
     upright = extent_m[:2].max() < MIN_SPACING_M and least_m >= LEAST_SPACING_M
-    # Two at one place in an array of another size are no fault of the unit: the array refuses and names them.
+    # Two microphones at the same place in an otherwise plausible array are not a wrong unit;
+    # `MicrophoneArray` reports them.
     small = LEAST_SPACING_M <= least_m < MIN_SPACING_M or 0.0 < mean_m < MIN_SPACING_M
     metres = "expected positions in metres, got"
     for wrong, problem in (
         (wide_m > MAX_APERTURE_M, f"{metres} an array {wide_m:g} wide: millimetres? Then {_STATED}"),
         (mean_m > MAX_SPACING_M, f"{metres} microphones {mean_m:g} apart: centimetres? Then {_STATED}"),
         (small, f"{metres} microphones {least_m:g} apart: divided by 1000?"),
-        (upright, "expected a horizontal extent, got a vertical line, which hears every azimuth alike"),
+        (upright, "expected a horizontal extent, got a vertical line, which cannot resolve azimuth"),
     ):
         if wrong:
             raise InputFileError(path, problem)
@@ -295,14 +298,14 @@ def _csv_rows(path: Path, text: str) -> _Rows:
     columns, names, unit_m = _csv_columns(path, cells)
     cells = cells[unit_m is not None :]
     labels = [row[names] if names is not None and names < len(row) else "" for row in cells]
-    # A gain beside the positions is no name, whatever order it is in.
+    # A gain beside the positions is not a name, whatever its order.
     order = range(len(cells)) if any("." in label for label in labels) else by_number(path, labels)
     taken: list[Row] = [[cells[at][c] if c < len(cells[at]) else None for c in columns] for at in order]
     return _Rows(taken, unit_m=unit_m or 1.0)
 
 
 def _csv_columns(path: Path, cells: list[list[str]]) -> tuple[list[int], int | None, float | None]:
-    """Return the columns of x, y and z, that of names, and the unit in metres of a header, where one is."""
+    """Return the columns of x, y and z, the column of names, and a header's unit in metres."""
     first = cells[0] if cells else []
     named = {m[1].lower(): (i, m[2]) for i, cell in enumerate(first) if (m := _HEADER.fullmatch(cell))}
     if len(named) == 3:
@@ -323,7 +326,7 @@ def _csv_columns(path: Path, cells: list[list[str]]) -> tuple[list[int], int | N
 
 
 def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]:
-    """Return the columns of lines of four numbers if one, in front or behind, counts the microphones."""
+    """Return the columns of four-number lines if exactly one of first and last numbers the microphones."""
     counted = [{row[i] for row in cells if len(row) == 4 and row[i].isdecimal()} for i in (0, 3)]
     counts = [i for i, found in zip((0, 3), counted, strict=True) if len(found) == len(cells)]
     if len(counts) == 1:
@@ -334,7 +337,7 @@ def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]
 
 
 def _odas_rows(path: Path, text: str, begin: int) -> _Rows:
-    """Return the microphones of a configuration of ODAS without its comments."""
+    """Return the microphones of an ODAS configuration without comments."""
     block, used = _GROUPS.match(text, begin), _MAP.search(text)
     rows: list[Row] = [found[1].split(",") for found in _MU.finditer(block[0] if block else "")]
     if block is None or block[0].count("{") != len(rows) or any(len(row) != 3 for row in rows):
@@ -365,7 +368,7 @@ def _json_rows(path: Path, data: bytes) -> _Rows:
 
 
 def _numbers(path: Path, rows: list[Row]) -> list[list[float]]:
-    """Return the coordinates of each microphone; refuse what is no finite number."""
+    """Return the coordinates of each microphone; refuse all but finite numbers."""
     found: list[list[float]] = [[] for _ in rows]
     for number, row in enumerate(rows, start=1):
         for axis, value in zip("xyz", row, strict=True):
@@ -377,7 +380,7 @@ def _numbers(path: Path, rows: list[Row]) -> list[list[float]]:
 
 
 def _number(value: object) -> float | None:
-    """Return a finite number from text or JSON, None where it is none."""
+    """Convert text or a JSON value to a finite number; None if it is not one."""
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Compare positions with those of a model or a data set, in whatever order; put numbered names in order."""
+"""Comparison of microphone positions in any order with expected ones, and sorting by numbers in names."""
 
 import logging
 import re
@@ -12,9 +12,9 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import FloatArray, IndexArray
 
-# Array files give millimetres; half a wavelength at the top of the feature's band is 114 mm.
+# Array files are accurate to a millimetre; half a wavelength at the top of the feature's band is 114 mm.
 TOLERANCE_M = 1e-3
-# Only `run` and `live` go on with a model of another array; the other commands have no such option to name.
+# Only `run` and `live` accept a model of another array; the other commands lack this option.
 TRAIN = "Make a model for it (worldstate model make; of recordings model features, model fit)"
 WAY_OUT = f"{TRAIN}, or go on with --uncalibrated (settings=ListenSettings(uncalibrated=True))"
 _UNITS = {1.0: "", 1e-3: "looks like millimetres", 1e-2: "looks like centimetres"}
@@ -23,16 +23,16 @@ _LOG = logging.getLogger(__name__)
 
 
 def microphone_order(expected_m: FloatArray, array: MicrophoneArray) -> IndexArray | None:
-    """Return the channels of `array` in the order of the expected positions, None where they are elsewhere.
+    """Return the channels of `array` in the order of the expected positions; None if they do not match.
 
-    A displacement of the whole array does not count: plane waves show differences of delays only.
+    A displacement of the whole array is ignored, because plane waves depend only on differences of delays.
 
     Parameters
     ----------
     expected_m : ndarray, shape (M, 3)
         Positions in `base_link` axes, metres.
     array : MicrophoneArray
-        To be compared, to 1 mm.
+        Array to compare, with a tolerance of 1 mm.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def microphone_order(expected_m: FloatArray, array: MicrophoneArray) -> IndexArr
 
 
 def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:
-    """Say how an array differs from the expected positions, (M, 3), and what is the likely cause.
+    """Describe how an array differs from the expected positions, (M, 3), and the likely cause.
 
     Examples
     --------
@@ -66,12 +66,12 @@ def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:
 
 
 def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
-    """Return the channels of `array` in the order of the one that a model was made for.
+    """Return the channels of `array` in the order of the array of a model.
 
     Raises
     ------
     OutOfDomainError
-        If the microphones stand elsewhere; the message names the array, the difference and the way out.
+        If the positions differ; the message contains the array, the difference and a remedy.
 
     Examples
     --------
@@ -88,10 +88,10 @@ def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: st
 
 
 def by_number(path: Path, names: Sequence[str]) -> list[int]:
-    """Return the order in which microphones with such names are taken; say so if it is not that of numbers.
+    """Return the order of microphones with numbered names; warn if the given order is another.
 
-    Names that differ in numbers alone and stand as a shell or a spreadsheet sorts them (mic_1, mic_10, mic_2)
-    are taken in the order of the numbers. Any other order counts as deliberate and is kept.
+    If the names differ only in their numbers and are sorted as by a shell or a spreadsheet (mic_1, mic_10,
+    mic_2), they are sorted by number. Any other order is taken as intended and kept.
 
     Examples
     --------
@@ -106,7 +106,7 @@ def by_number(path: Path, names: Sequence[str]) -> list[int]:
     ranked = sorted(given, key=numbers.__getitem__)
     if len(texts) > 1 or len({*numbers}) < len(names) or ranked == given:
         return given
-    # Locales sort without regard to punctuation: mic_10.wav before mic_1.wav.
+    # Locales may ignore punctuation: mic_10.wav before mic_1.wav.
     bare = [re.sub(r"[\W_]", "", name) for name in small]
     by_text = any(sorted(one) == one for one in (list(names), small, bare))
     done = "taken in that of the numbers" if by_text else "kept as they were given"
@@ -121,9 +121,9 @@ def _centred(positions_m: FloatArray) -> FloatArray:
 
 
 def _order(expected: FloatArray, found: FloatArray) -> IndexArray | None:
-    """Return the nearest of `found` for each of `expected` if all are near and each is taken once."""
+    """Return the nearest of `found` for each of `expected` if all are within the tolerance and distinct."""
     distance = np.linalg.norm(expected[:, None] - found[None], axis=-1)
-    # Channel by channel first, so that microphones closer than the tolerance keep their order.
+    # Try the given order first, so that microphones closer than the tolerance keep it.
     if np.diagonal(distance).max() <= TOLERANCE_M:
         return np.arange(len(expected))
     nearest = distance.argmin(axis=1)
@@ -132,7 +132,7 @@ def _order(expected: FloatArray, found: FloatArray) -> IndexArray | None:
 
 
 def _cause(expected: FloatArray, found: FloatArray) -> str:
-    """Return the first simple mistake that explains the difference, empty where none does."""
+    """Return the first simple mistake that explains the difference, empty if there is none."""
     for unit, in_words in _UNITS.items():
         for turn, how in _turns():
             if _order(expected, unit * found @ turn.T) is not None:
@@ -144,19 +144,19 @@ def _cause(expected: FloatArray, found: FloatArray) -> str:
 
 
 def _turns() -> "list[tuple[FloatArray, str]]":
-    """Return the 48 ways to name and count three axes, the simple ones first."""
+    """Return the 48 permutations and reflections of three axes, simple ones first."""
     found = []
     for axes, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         turn = np.diag(signs)[:, axes]
         swapped, flipped = axes != (0, 1, 2), signs.count(-1.0)
-        # Two axes counted backwards are half a turn about the third.
+        # A reversal of two axes is half a turn about the third.
         how = "looks mirrored" if flipped % 2 else "looks turned by half a turn" if flipped else ""
         found.append((6 * swapped + flipped, turn, "axes swapped" if swapped else how))
     return [(turn, how) for _, turn, how in sorted(found, key=lambda item: item[0])]
 
 
 def _rotation(expected: FloatArray, found: FloatArray) -> str:
-    """Return the rotation that explains the difference channel by channel (Kabsch's solution)."""
+    """Return the rotation that explains the difference with channels in order (Kabsch's method)."""
     left, _, right = np.linalg.svd(found.T @ expected)
     proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     turn = left @ proper @ right

@@ -1,4 +1,4 @@
-"""Checkpoints on disk: the filter's memory, site estimate, a sequence's history, the sound of the arms."""
+"""Checkpoint files: filter, site estimate, history of the sequence, and sound of the arms."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,12 +16,12 @@ from .file_io import read_json, refused_as_file, write_json
 
 @dataclass(frozen=True, slots=True)
 class PortNumbers:
-    """Numbers of signed datagrams that were taken last, by port: what a restart must not take again."""
+    """Last accepted number of signed datagrams per port, so that a restart does not accept them again."""
 
     last: Mapping[str, int]
 
 
-# What a checkpoint holds beside the memory of the filter.
+# Parts of a checkpoint in addition to the filter.
 _BESIDE: dict[str, Any] = {
     "site": SiteEstimate, "history": SequenceHistory, "street": StreetHearing, "ports": PortNumbers,
 }  # fmt: skip
@@ -29,23 +29,23 @@ _BESIDE: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A chain between two hops; what is read back continues bit for bit.
+    """State of a chain between two hops; a restored chain continues bit for bit.
 
     Parameters
     ----------
     world : WorldFilter
-        The belief.
+        The filter with its belief.
     site : SiteEstimate or None
-        `SiteSignature.estimate`; None where no site is learned.
+        `SiteSignature.estimate`; None if no site is learned.
     history : SequenceHistory or None
         `SequenceReader.history`; None without a sequence model.
     street : StreetHearing or None
-        `StreetListener.hearing`; likewise.
+        `StreetListener.hearing`; None without a sequence model.
     ports : PortNumbers or None
-        None where no port has a key.
+        None if no port has a key.
     senses : object or None
-        What a `Listener` goes on with at the very next sample: the sound and images of its windows. No file
-        holds it.
+        Sound and images of the windows, from which a `Listener` continues at the next sample. It is not
+        written to files.
 
     Examples
     --------
@@ -63,20 +63,20 @@ class Checkpoint:
     senses: object = field(default=None, compare=False, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values: the filter's checkpoint with the other parts beside its memory."""
+        """Return values for JSON: the filter's checkpoint with the other parts added."""
         beside = {name: getattr(self, name) for name in _BESIDE}
         return self.world.to_dict() | {k: None if v is None else encode(v) for k, v in beside.items()}
 
     @classmethod
     def from_dict(cls, data: Any) -> "Checkpoint":
-        """Return what `to_dict` wrote; the filter's own checkpoint reads as one without the other parts.
+        """Return what `to_dict` wrote; a checkpoint of the filter alone is read without the other parts.
 
         Raises
         ------
         SchemaVersionError
-            On another schema or another major version.
+            If the schema or its major version is another.
         InvalidArgumentError
-            If a value is missing, of the wrong type or out of range; the message says where.
+            If a value is missing, of the wrong type or out of range; the message contains its place.
         """
         world = WorldFilter.from_dict(data)
         beside = {name: (kind, data.get(name)) for name, kind in _BESIDE.items()}
@@ -84,14 +84,14 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint to exactly this path, whole or not at all.
+    """Write a checkpoint to a file, atomically.
 
     Parameters
     ----------
     path : str or Path
-        Exactly this file.
+        File to write.
     checkpoint : Checkpoint
-        Filter and site.
+        Checkpoint to write.
 
     Raises
     ------
@@ -115,19 +115,19 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     Parameters
     ----------
     path : str or Path
-        What `save_checkpoint` wrote.
+        File that `save_checkpoint` wrote.
 
     Returns
     -------
     Checkpoint
-        Filter and site.
+        The checkpoint of the file.
 
     Raises
     ------
     InputFileError
-        If the file is missing, too large, truncated or no JSON, or a value is missing or out of range.
+        If the file is missing, too large, truncated or not JSON, or a value is missing or out of range.
     SchemaVersionError
-        If it is of another major version.
+        If the file has another major version.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A context from JSON: corners and lanes of a junction, how fast people drive there, how often they come."""
+"""Context files in JSON: corners and lanes of a junction, speeds there, and arrival rates."""
 
 import logging
 import math
@@ -17,7 +17,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Arm:
-    """One approach side: the place of its corner and of the lane behind it, or an open road."""
+    """One approach side: the position of its corner and of the lane behind it, or an open road."""
 
     direction: str
     corner_m: tuple[float, float] | None = None
@@ -39,7 +39,7 @@ class _Arm:
 
 @dataclass(frozen=True, slots=True)
 class _ContextFile:
-    """What a context file holds."""
+    """Fields of a context file."""
 
     arms: tuple[_Arm, ...] | None = None
     rates: Rates | None = None
@@ -50,7 +50,7 @@ class _ContextFile:
 
     def context(self) -> Context:
         usual = Context()
-        # In the usual order, which is that of a signature model's directions: left, right.
+        # The usual order left, right is that of a signature model's directions.
         order = {direction: place for place, direction in enumerate(usual.directions)}
         known = usual.occluders
         if self.arms is not None:
@@ -79,13 +79,14 @@ class _ContextFile:
 
 
 def read_context(path: str | Path) -> Context:
-    """Read a context from JSON; whatever it does not say is as in `Context()`.
+    """Read a context from JSON; missing values are those of `Context()`.
 
-    ``{"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}``: the corner that
-    hides an arm (x ahead, y to the left of the ego, metres) and the distance ahead of the lane in which
-    vehicles come from there; optional ``"speed_mps"`` of these and ``"corner_std_m"``. An arm with
-    ``"open": true`` in their place hides nothing. Beside the arms ``"rates"`` and ``"priors"`` as `Rates` and
-    `Priors` name them, ``"ego_speed_mps"``, ``"site"`` and ``"view_half_angle_deg"``.
+    ``{"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}`` gives the corner
+    that hides an arm (x ahead, y to the left of the ego, metres) and the distance ahead to the lane of
+    vehicles from there. ``"speed_mps"`` of these vehicles and ``"corner_std_m"`` are optional. An arm with
+    ``"open": true`` instead is not occluded. Optional in addition to the arms are ``"rates"`` and
+    ``"priors"`` with the fields of `Rates` and `Priors`, ``"ego_speed_mps"``, ``"site"`` and
+    ``"view_half_angle_deg"``.
 
     Parameters
     ----------
@@ -95,13 +96,13 @@ def read_context(path: str | Path) -> Context:
     Returns
     -------
     Context
-        As the file says.
+        The context of the file.
 
     Raises
     ------
     InputFileError
-        If the file is missing, too large, no JSON, has a key that means nothing here, or a number is missing
-        or out of range.
+        If the file is missing, too large or not JSON, has an unknown key, or a number is missing or out of
+        range.
 
     Examples
     --------

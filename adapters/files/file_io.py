@@ -1,8 +1,8 @@
-"""Files: text, JSON of one dataclass, CSV rows and arrays, read within bounds; written whole or not at all.
+"""Input and output of files within limits: text, JSON of one dataclass, CSV rows and arrays.
 
-A reader never meets half a file, and a run that fails leaves nothing behind; only logs of a run without an
-end grow under their own name. A link is followed: what it
-points to is replaced, and the link stays. Devices, pipes and folders are never replaced.
+Files are written atomically: a reader never sees a partial file, and a run that fails leaves no file. Only
+logs of an unlimited run grow under their own name. A symbolic link is kept, and its target is replaced.
+Devices, pipes and folders are never replaced.
 """
 
 import csv
@@ -31,7 +31,7 @@ from worldstate.ground.serialisation import decode, decode_json
 
 try:
     import fcntl
-except ImportError:  # Windows, which lets no other program write to an open file anyway
+except ImportError:  # On Windows no other program can write to an open file
     fcntl = None  # type: ignore[assignment]
 
 _LOG = logging.getLogger(__name__)
@@ -39,8 +39,8 @@ _LOG = logging.getLogger(__name__)
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Lend a temporary sibling of `path`; it takes the name on success and disappears on error."""
-    # The sibling keeps the suffix, because writers such as `numpy.savez` and `soundfile` look at it.
+    """Yield a temporary sibling of `path` that replaces it on success and is removed on error."""
+    # The sibling has the same suffix, because `numpy.savez` and `soundfile` use the suffix.
     target = check_target(path)
     temporary = target.with_name(f".{target.stem[:100]}-{uuid.uuid4().hex[:12]}{target.suffix}")
     try:
@@ -51,20 +51,20 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         try:
             _remove(temporary)
-        except BaseException:  # a second Ctrl-C; the first one is on its way up already
+        except BaseException:  # a second Ctrl-C, while the first one propagates
             _remove(temporary)
             raise
 
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[BinaryIO]:
-    """Lend an open file that takes its name at the end."""
+    """Yield an open file that gets its name at the end."""
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         yield file
 
 
 def check_target(path: str | Path) -> Path:
-    """Return where output to `path` would go, links followed; refuse what is neither free nor a plain file.
+    """Return the target of output to `path`, with links resolved; refuse anything but a new or plain file.
 
     Examples
     --------
@@ -84,26 +84,26 @@ def check_target(path: str | Path) -> Path:
         raise InputFileError(path, "expected a file to write to, found a device or pipe")
     there = target if target.exists() else target.parent
     if not (os.access(there, os.W_OK) and os.access(target.parent, os.W_OK | os.X_OK)):
-        raise InputFileError(path, "expected a place to write to, permission denied")
+        raise InputFileError(path, "expected a place to write to, but permission is denied")
     return target
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 with plain newlines, whole or not at all; packed if the name ends in .gz."""
+    """Write `text` as UTF-8 with plain newlines, atomically; compressed if the name ends in .gz."""
     with atomic_path(path) as temporary:
         data = text.encode()
         temporary.write_bytes(gzip.compress(data, mtime=0) if temporary.suffix == ".gz" else data)
 
 
 def write_json(path: str | Path, value: object, indent: int | None = None) -> None:
-    """Write a value as strict JSON, whole or not at all."""
+    """Write a value as strict JSON, atomically."""
     write_text(path, json.dumps(value, allow_nan=False, indent=indent) + "\n")
 
 
 def write_rows(
     path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]], newline: str = "\r\n"
 ) -> None:
-    """Write CSV with a header, whole or not at all."""
+    """Write CSV with a header, atomically."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator=newline)
         writer.writerow(columns)
@@ -116,7 +116,7 @@ FileOpener: TypeAlias = Callable[[Path], "AbstractContextManager[BinaryIO | Grow
 
 @contextmanager
 def line_writer(path: Path | None, opener: FileOpener = whole_file) -> Iterator[Callable[[str], None]]:
-    """Lend a function that writes lines of UTF-8 to a file; without a path one that writes nothing."""
+    """Yield a function that writes lines of UTF-8 to a file, or that does nothing without a path."""
     if path is None:
         yield lambda line: None
         return
@@ -131,30 +131,30 @@ def line_writer(path: Path | None, opener: FileOpener = whole_file) -> Iterator[
 
 
 class GrowingFile:
-    """File of a run without an end: under its own name from the start, every record in it when written.
+    """Log file of an unlimited run, which has its name from the start and contains each record at once.
 
-    What was there before becomes NAME.N.SUFFIX, the first number that is free, and so does a file that is
-    full; of this run one such file is kept. What cannot be written, or would go to a file that was removed,
-    is logged once and counted: a log is not what a run is for.
+    An earlier file of the same name is renamed to NAME.N.SUFFIX with the first free number, and so is a full
+    file; only one full file of this run is kept. A record that cannot be written, or whose file was removed,
+    is counted, and the cause is logged once: a failing log must not stop the run.
 
     Parameters
     ----------
     path : str or Path
-        Where to write.
+        File to write.
     most_bytes : int, optional
-        When a file is full. Without it none is.
+        Size at which the file is full; by default it is never full.
 
     Attributes
     ----------
     lost : int
-        Records that were not written.
+        Number of records that were not written.
     whole : bool
-        Whether the file has every record up to now; it takes no more of them until `begin` or `go_on`.
+        Whether the file contains every record so far. If not, it accepts no more until `begin` or `go_on`.
 
     Raises
     ------
     InputFileError
-        If it cannot be opened, or another run writes to it.
+        If the file cannot be opened, or another run writes to it.
 
     Examples
     --------
@@ -174,7 +174,7 @@ class GrowingFile:
         self._aside: tuple[Path, os.stat_result] | None = None
 
     def begin(self) -> None:
-        """Begin a new file."""
+        """Start a new file."""
         try:
             if is_named(self._file, self.path):
                 self._make_way()
@@ -187,29 +187,29 @@ class GrowingFile:
             self._lose(str(error))
 
     def _make_way(self) -> None:
-        """Give this file the name of the one before it, unless that is gone or another's by now."""
+        """Rename this file to the name of the previous one, unless that is missing or of another run."""
         here, before = os.fstat(self._file.fileno()), self._aside
         ours = before and before[0].exists() and os.path.samestat(before[0].stat(), before[1])
         target = check_target(self.path)
         self._aside = _set_aside(self._file, target, before[0] if before and ours else None), here
 
     def go_on(self) -> None:
-        """Begin a new file if this one is full or gone; else take records again after one that was lost."""
+        """Start a new file if this one is full or removed, else accept records again after a lost one."""
         if self.full:
             self.begin()
         self.whole = not self._file.closed
 
     @property
     def full(self) -> bool:
-        """Whether the file has its size, or its name is no longer its own."""
+        """Whether the file has reached its size, or its name now belongs to another file."""
         return (self._most is not None and self._bytes >= self._most) or not is_named(self._file, self.path)
 
     def tell(self) -> int:
-        """Return how long the file is, bytes."""
+        """Return the length of the file in bytes."""
         return self._bytes
 
     def write(self, record: bytes) -> int:
-        """Write a record, whole or not at all."""
+        """Write a record completely or not at all."""
         left = memoryview(record)
         if not is_named(self._file, self.path):
             self._lose(_GONE)
@@ -217,7 +217,7 @@ class GrowingFile:
             while left and self.whole:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            with suppress(OSError):  # else what comes next would follow a hole
+            with suppress(OSError):  # otherwise the next record would follow a gap
                 self._file.seek(self._bytes)
                 self._file.truncate()
             self._lose(f"expected room to write ({error.strerror})")
@@ -241,12 +241,12 @@ class GrowingFile:
 
 
 def claimed_file(path: str | Path) -> io.FileIO:
-    """Open a new file at `path` that no other run writes to; what is there becomes NAME.N.SUFFIX.
+    """Open a new file at `path` that no other run writes to; rename an existing one to NAME.N.SUFFIX.
 
     Raises
     ------
     InputFileError
-        If it cannot be opened, or another run writes to it.
+        If the file cannot be opened, or another run writes to it.
     """
     target = check_target(path)
     while True:
@@ -260,35 +260,35 @@ def claimed_file(path: str | Path) -> io.FileIO:
 
 
 def is_named(file: io.FileIO, path: Path) -> bool:
-    """Whether a path still names an open file."""
+    """Return whether a path still refers to an open file."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except (OSError, ValueError):  # it was removed; it is closed
+    except (OSError, ValueError):  # removed, or closed
         return False
 
 
 def _lock(file: io.FileIO, path: str | Path) -> None:
-    """Claim a file until it is closed, where the system has such locks."""
+    """Lock a file until it is closed, if the system has such locks."""
     if fcntl is None:
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         file.close()
-        raise InputFileError(path, "expected a file of its own, another run writes to it") from error
+        raise InputFileError(path, "expected a file of its own, but another run writes to it") from error
     except OSError:  # a file system without locks
         return
 
 
 def _set_aside(file: io.FileIO, target: Path, name: Path | None = None) -> Path:
-    """Rename an open file to `name`, else to NAME.N.SUFFIX with the first number that is free; return it."""
-    if fcntl is None:  # Windows renames no open file; elsewhere its lock keeps other runs out
+    """Rename an open file to `name`, by default to NAME.N.SUFFIX with the first free number; return it."""
+    if fcntl is None:  # Windows cannot rename an open file; elsewhere its lock excludes other runs
         file.close()
     numbers = itertools.count(1)
     while name is None:
         free = target.with_name(f"{target.stem}.{next(numbers)}{target.suffix}")
         with suppress(FileExistsError):
-            free.touch(exist_ok=False)  # so that no other run takes the same number
+            free.touch(exist_ok=False)  # reserves the number against other runs
             name = free
     return target.replace(name)
 
@@ -309,7 +309,7 @@ MAX_CELL = 1000
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
-    """Return what a file in UTF-8 of at most so many bytes holds."""
+    """Return the content of a UTF-8 file of at most `max_bytes`."""
     try:
         return read_bytes(path, what, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -317,12 +317,12 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
 
 
 def plain_file(path: str | Path, what: str) -> BinaryIO:
-    """Open a file to read; refuse a pipe or device, which may never end or never begin, and a name with NUL.
+    """Open a file to read; refuse a pipe or device, which may never start or end, and a name with NUL.
 
     Raises
     ------
     InputFileError
-        If it cannot be opened, or is no file.
+        If the file cannot be opened, or is not a plain file.
 
     Examples
     --------
@@ -330,7 +330,7 @@ def plain_file(path: str | Path, what: str) -> BinaryIO:
     Traceback (most recent call last):
     worldstate.ground.errors.InputFileError: /dev/zero: expected positions, found a device or pipe
     """
-    # Without waiting: a pipe is opened once somebody writes to it.
+    # Non-blocking, because opening a pipe otherwise waits until a program writes to it.
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
         file = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115 - the caller's
@@ -342,12 +342,12 @@ def plain_file(path: str | Path, what: str) -> BinaryIO:
     return file
 
 
-UNREADABLE = (OSError, EOFError, zlib.error)  # Of a disk, or of a packed file
+UNREADABLE = (OSError, EOFError, zlib.error)  # Errors of a disk, or of a compressed file
 
 
 @contextmanager
 def unpacked_file(path: str | Path, what: str) -> Iterator[BinaryIO]:
-    """Lend an open file; if its name ends in .gz, what is packed in it, unpacked as far as it is read."""
+    """Yield an open file, decompressed while it is read if its name ends in .gz."""
     with plain_file(path, what) as file:
         if Path(path).suffix != ".gz":
             yield file
@@ -357,7 +357,7 @@ def unpacked_file(path: str | Path, what: str) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
-    """Return what a file, unpacked if its name ends in .gz, of at most so many bytes holds."""
+    """Return the content of a file of at most `max_bytes`, decompressed if its name ends in .gz."""
     try:
         with unpacked_file(path, what) as file:
             data = file.read(max_bytes + 1)
@@ -370,13 +370,13 @@ def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
 
 
 def read_json(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> object:
-    """Return what a JSON file holds, decoded strictly."""
+    """Return the content of a JSON file, strictly decoded."""
     with refused_as_file(path):
         return decode_json(read_text(path, what, max_bytes), what)
 
 
 def read_record(kind: type[T], path: str | Path, what: str, *, by_hand: bool = False) -> T:
-    """Return the value of type `kind` that a JSON file holds, which is checked for its keys if `by_hand`."""
+    """Return the value of type `kind` in a JSON file; with `by_hand`, unknown keys are refused."""
     with refused_as_file(path):
         given = read_json(path, f"a {what} file")
         if by_hand:
@@ -385,8 +385,8 @@ def read_record(kind: type[T], path: str | Path, what: str, *, by_hand: bool = F
 
 
 def _check_keys(given: object, kind: type, where: str) -> None:
-    """Refuse keys that mean nothing in what is written by hand: a wrong name would be left out in silence."""
-    if not isinstance(given, dict):  # the decoder says what it is
+    """Refuse unknown keys in hand-written files, because a misspelt key would be silently ignored."""
+    if not isinstance(given, dict):  # the decoder reports it
         return
     hints = {one.name: get_type_hints(kind)[one.name] for one in fields(kind)}
     if unknown := sorted(set(given) - set(hints)):
@@ -399,13 +399,13 @@ def _check_keys(given: object, kind: type, where: str) -> None:
 
 
 def _record_in(hint: Any) -> Any:
-    """Return the dataclass of which a hint allows one or several, None without one."""
+    """Return the dataclass in a type hint, also within a container; None without one."""
     return hint if is_dataclass(hint) else next(filter(None, map(_record_in, get_args(hint))), None)
 
 
 @contextmanager
 def refused_as_file(path: object, where: str = "") -> Iterator[None]:
-    """Turn refusals inside into those of a file, which begin with its name and the place in it."""
+    """Convert errors inside to errors of a file, with its name and the place in it."""
     try:
         yield
     except SchemaVersionError as error:
@@ -421,7 +421,7 @@ def read_rows(
     most_bytes: int = MAX_BYTES,
     most_rows: int = MAX_ROWS,
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    r"""Yield the wanted columns of a CSV file with a header, and the optional ones that it has, by line.
+    r"""Yield line number and wanted columns of each CSV row, with the optional columns that exist.
 
     Examples
     --------
@@ -431,7 +431,7 @@ def read_rows(
     ...     list(read_rows(Path(folder) / "list.csv", ["ID"]))
     [(2, {'ID': '1_00_0002'})]
     """
-    # Decoded as it is read: `StringIO` takes four bytes a character.
+    # Decoded while it is read, because `StringIO` takes four bytes per character.
     data = io.BytesIO(read_bytes(path, "a CSV file", most_bytes))
     reader = csv.reader(io.TextIOWrapper(data, encoding="utf-8-sig", newline=""))
     try:
@@ -451,7 +451,7 @@ def read_rows(
 
 
 def number(path: str | Path, line: int, row: dict[str, str], column: str) -> float:
-    """Return the finite number in a column of a row that `read_rows` yielded."""
+    """Return the finite number in a column of a row from `read_rows`."""
     try:
         value = float(row[column])
     except ValueError:
@@ -465,7 +465,7 @@ def number(path: str | Path, line: int, row: dict[str, str], column: str) -> flo
 def _places(
     path: Path, header: list[str], columns: Collection[str], optional: Collection[str]
 ) -> dict[str, int]:
-    """Return in which place of a line each column stands."""
+    """Return the position of each column in a line."""
     if len(header) > MAX_COLUMNS:
         raise InputFileError(path, f"expected at most {MAX_COLUMNS} columns, got {len(header)}")
     header = [name.strip() for name in header]
@@ -478,7 +478,7 @@ def _places(
 
 
 def in_order(stamps_ns: Sequence[int], source: str) -> list[int]:
-    """Return the places of increasing stamps, of equal ones the last; a warning counts what was not so.
+    """Return the positions of increasing stamps, the last one of equal stamps; warn of any others.
 
     Examples
     --------
@@ -495,13 +495,13 @@ def in_order(stamps_ns: Sequence[int], source: str) -> list[int]:
 
 Result = TypeVar("Result")
 
-# The end of a zip file: a record of 22 bytes, then a comment of at most 65,535.
+# A zip file ends with a record of 22 bytes and a comment of at most 65,535 bytes.
 _END, _END_BYTES, _LONGEST_COMMENT = b"PK\5\6", 22, 65_535
 _MAX_DIRECTORY_BYTES = 1 << 16
 
 
 def save_npz(path: str | Path, values: Mapping[str, Any]) -> None:
-    """Write arrays by name."""
+    """Write arrays under their names."""
     with whole_file(path) as file:
         np.savez_compressed(file, **values)
 
@@ -509,7 +509,7 @@ def save_npz(path: str | Path, values: Mapping[str, Any]) -> None:
 def load_npz(
     path: str | Path, what: str, max_bytes: int, read: Callable[[dict[str, np.ndarray]], Result]
 ) -> Result:
-    """Return what `read` makes of the arrays of a file, which take at most `max_bytes` when decoded.
+    """Return the result of `read` for the arrays of a file, which take at most `max_bytes` when decoded.
 
     Examples
     --------
@@ -531,18 +531,18 @@ def load_npz(
         raise InputFileError(path, f"expected {what} as npz ({error.strerror or error})") from error
     except InvalidArgumentError as error:
         raise InputFileError(path, f"expected {what} ({error})") from error
-    except Exception as error:  # zipfile, zlib and numpy each have errors of their own for damaged bytes
-        raise InputFileError(path, f"expected {what} as npz, they do not read: {error}") from error
+    except Exception as error:  # zipfile, zlib and numpy raise different errors for damaged bytes
+        raise InputFileError(path, f"expected {what} as npz, but it cannot be read: {error}") from error
 
 
 def _decoded_bytes(file: BinaryIO) -> int:
-    """Return how much memory the arrays take, as numbers of 64 bits at least, from their headers alone."""
+    """Return the memory that the arrays take, with at least 64 bits per number, from their headers."""
     _check_directory(file)
     total = 0
     with zipfile.ZipFile(file) as archive:
         for name in archive.namelist():
             with archive.open(name) as member:
-                # The header of a later version may be 4 GiB long.
+                # The header of a later version may be 4 GiB long, so it is refused.
                 if np.lib.format.read_magic(member) != (1, 0):
                     raise InvalidArgumentError(f"{name}: expected an array in version 1.0 of its format")
                 shape, _, dtype = np.lib.format.read_array_header_1_0(member)
@@ -552,7 +552,7 @@ def _decoded_bytes(file: BinaryIO) -> int:
 
 
 def _check_directory(file: BinaryIO) -> None:
-    """Refuse a zip file whose list of members would itself fill the memory."""
+    """Refuse a zip file whose list of members could itself fill the memory."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(size - _END_BYTES - _LONGEST_COMMENT, 0))
     tail = file.read()

@@ -1,4 +1,4 @@
-"""Model files: versioned JSON that holds coefficients only."""
+"""Model files: versioned JSON that contains only coefficients."""
 
 import json
 from collections.abc import Mapping
@@ -23,14 +23,14 @@ from worldstate.ground.serialisation import ADDED, Count, Layout, Probability, V
 from .array_file import file_of_model
 from .file_io import read_record, refused_as_file, write_text
 
-# Of a number of a model file. The largest that ships is a sample rate; a sum of thousands of products of two
-# such numbers, squared, is still finite.
+# Largest number allowed in a model file. The largest in shipped models is a sample rate; a squared sum of
+# thousands of products of two numbers up to this limit is still finite.
 LARGEST = 1e12
 
 
 @dataclass(frozen=True, slots=True)
 class DataSource:
-    """What a model was made or examined with, and under which licence."""
+    """Data with which a model was made or evaluated, and their licence."""
 
     name: str
     use: Literal["coefficients", "thresholds", "exam"]
@@ -39,7 +39,7 @@ class DataSource:
 
 @dataclass(frozen=True, slots=True)
 class KindShare:
-    """Share of the approaches of one kind of road user that raised an advisory in the simulated exam."""
+    """Share of approaches of one kind of road user with an advisory in the simulated evaluation."""
 
     kind: str
     detected: Probability
@@ -48,25 +48,25 @@ class KindShare:
 
 @dataclass(frozen=True, slots=True)
 class RealFigure:
-    """A figure in a simulated exam, and the same figure on real recordings.
+    """A figure of a simulated evaluation, and the same figure on real recordings.
 
     Parameters
     ----------
     figure : str
         Its name in words.
     simulated, real : float
-        In the exam of the model that heard the recordings, on simulated streets, and on the recordings.
+        Values on simulated streets and on the recordings, for the model that was evaluated on the recordings.
     low, high : float
-        95 % interval of the real one.
+        95 % interval of the real value.
     array : str
-        To which these microphones belong.
+        Array with these microphones.
     microphones, recordings : int
-        How many of each there are.
+        Number of microphones and of recordings.
     source : str
-        Command and version that measured it.
+        Command and version of the measurement.
     own : bool
-        Whether the model is for this array and for an ego that stands, as it did; else there is no real
-        recording for the model.
+        Whether the model is for this array and a standing ego, as in the recordings; otherwise no real
+        recording exists for the model.
 
     Examples
     --------
@@ -97,36 +97,36 @@ class RealFigure:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where a model comes from.
+    """Origin of a model.
 
     Parameters
     ----------
     dataset : str
-        Name of the data that it was trained on.
+        Name of the training data.
     group : str
-        Which part of it: static, dynamic or all.
+        Part of the data: static, dynamic or all.
     classifier : str
-        What was trained.
+        Type of the trained classifier.
     scikit_learn : str
-        Version that trained it.
+        Version used for training.
     seed : int
-        Of the generator that drew folds.
+        Seed of the generator of folds.
     training_recordings : tuple of str
-        Environment and recording, as ``SA1/34``: an evaluation refuses to score these.
+        Environment and recording, such as ``SA1/34``; an evaluation refuses to score these.
     excluded_lists : tuple of str
-        Names of the lists whose recordings were left out.
+        Names of the lists of excluded recordings.
     figures : mapping of str to float
-        What out-of-fold windows scored during training.
+        Scores of out-of-fold windows during training.
     fit_for_use : bool
-        False of a model that was made to try a command out: no budget is stated with it.
+        False for a model that was made to try out a command: it guarantees no budget.
     sources : tuple of DataSource
-        Each source by use, with its licence; empty in files of a version before 1.8.
+        Each source with its use and licence; empty in files of a version before 1.8.
     exam : mapping of str to float
-        What the simulated exam found; empty without one and in files of a version before 1.9.
+        Results of the simulated evaluation; empty without one and in files of a version before 1.9.
     kinds : tuple of KindShare
-        Of each kind of road user, how many of its approaches the exam had and which share was detected.
+        Number of approaches in the evaluation and detected share, per kind of road user.
     real : tuple of RealFigure
-        What figures of a simulated exam are on real recordings: of this array if there are such, of others.
+        Figures of a simulated evaluation on real recordings, of this array if available, otherwise of others.
 
     Examples
     --------
@@ -151,21 +151,21 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """All that a trained model holds.
+    """A trained model with all its parts.
 
     Parameters
     ----------
     signature : SignatureModel or EnsembleModel
-        From features to likelihoods.
+        Maps features to likelihoods.
     policies : CueingPolicies
-        Threshold and risk map for each budget.
+        Threshold and risk map per budget.
     provenance : Provenance
-        Where it comes from.
+        Origin of the model.
     sequence : SequenceModel, optional
-        From seconds of the signature's evidence to the sides a vehicle comes from, and when.
+        Estimates from seconds of the signature's evidence from which sides a vehicle comes, and when.
     street : StreetModel, optional
-        Numbers of the belief about the approach sides; None of files of a version before 1.7, which are read
-        with those that ship.
+        Parameters of the belief about the approach sides. None in files of a version before 1.7, for which
+        the shipped parameters are used.
 
     Examples
     --------
@@ -188,37 +188,37 @@ class Model:
 
     @property
     def domain(self) -> ModelDomain | None:
-        """What the model was made for; None in files of a version before 1.2."""
+        """Domain of the model; None in files of a version before 1.2."""
         return self.signature.domain
 
 
 def read_model(
     path: str | Path | None = None, *, moving_ego: bool = False, array: MicrophoneArray | None = None
 ) -> Model:
-    """Read a model; without a path, the one that ships with the package.
+    """Read a model; by default the one that ships with the package.
 
     Parameters
     ----------
     path : str or Path, optional
-        JSON file, packed if its name ends in .gz, or the name of one that ships (`worldstate model list`).
+        JSON file, compressed if its name ends in .gz, or the name of a shipped model (`worldstate model
+        list`).
     moving_ego : bool
-        Of the two for the roof array, the one that was made for an ego that drives; for one that stands
-        otherwise.
+        Use the roof-array model for a moving ego instead of the one for a standing ego.
     array : MicrophoneArray, optional
-        What hears. If a model ships for a board with these microphones, it is read.
+        Array of the recording. If a model ships for a board with these microphones, it is read.
 
     Returns
     -------
     Model
-        With its provenance.
+        The model with its provenance.
 
     Raises
     ------
     InputFileError
-        If the file is missing, too large, truncated or no JSON, or a number is missing, not finite, above
+        If the file is missing, too large, truncated or not JSON, or a number is missing, not finite, above
         1e12 or out of range.
     SchemaVersionError
-        If it is of another major version.
+        If the file has another major version.
 
     Examples
     --------
@@ -234,14 +234,14 @@ def read_model(
                     raise InvalidArgumentError(f"{name}: expected numbers up to {LARGEST:g}, got {most:g}")
         return model
     shipped = _shipped(file)
-    # All else of it is read-only.
+    # Copied because only these parts are mutable.
     origin = shipped.provenance
     own = replace(origin, figures=dict(origin.figures), exam=dict(origin.exam))
     return replace(shipped, provenance=own, street=StreetModel())
 
 
 def _largest(value: Any) -> float:
-    """Return the largest magnitude among all numbers of a part: one above `LARGEST` overflows in products."""
+    """Return the largest magnitude in a part; products of numbers above `LARGEST` may overflow."""
     if isinstance(value, int | float | np.ndarray):
         return float(np.max(np.abs(value), initial=0.0))
     parts = value if isinstance(value, tuple) else ()
@@ -252,19 +252,19 @@ def _largest(value: Any) -> float:
 
 @cache
 def _shipped(path: Path) -> Model:
-    # Read once a process: a quarter of a second for every listener otherwise.
+    # Cached, because reading takes a quarter of a second.
     return read_record(Model, path, "model")
 
 
 def save_model(path: str | Path, model: Model) -> None:
-    """Write a model to exactly this path, whole or not at all.
+    """Write a model to a file, atomically.
 
     Parameters
     ----------
     path : str or Path
-        Exactly this file; packed if its name ends in .gz.
+        File to write; compressed if its name ends in .gz.
     model : Model
-        What to write.
+        Model to write.
 
     Raises
     ------

@@ -15,18 +15,19 @@ from worldstate.measurement.odometry import FARTHEST_M, EgoPose, Odometry
 
 from .file_io import in_order, number, read_rows, refused_as_file
 
-# Odometry of a standing vehicle scatters by some centimetres a second.
+# Odometry of a standing vehicle drifts by some centimetres per second.
 STANDING_MPS = 0.2
 _LOG = logging.getLogger(__name__)
-# No tyre holds more across, and no localiser turns so often, unless in degrees; of km/h poses move a 3.6th.
+# No tyre sustains more lateral acceleration, and no localiser turns that far unless in degrees. If speeds are
+# in km/h, poses move by the 3.6th part of them.
 MOST_ACROSS_MPS2, MOST_TURNED_RAD, LEAST_MOVED = 15.0, 25.0, 0.4
-# Three hours at 100 Hz, with a pose.
+# Three hours at 100 Hz with poses.
 MAX_BYTES, MAX_ROWS = 128 << 20, 1_080_000
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryLog:
-    """What odometry told, at increasing stamps on the clock of the sound.
+    """Odometry at increasing stamps on the clock of the sound.
 
     Examples
     --------
@@ -43,7 +44,7 @@ class OdometryLog:
 
     @classmethod
     def in_order(cls, told: Sequence[Odometry], source: str) -> "OdometryLog":
-        """Sort by stamps; of several with one stamp the last counts, and a warning counts them."""
+        """Sort by stamp and keep the last of equal stamps; log a warning with their numbers."""
         return cls(tuple(told[i] for i in in_order([one.stamp_ns for one in told], source)))
 
     @property
@@ -63,7 +64,7 @@ class OdometryRecord:
     yaw_rad: float | None = field(default=None, metadata=ADDED)
 
     def at(self, stamp_ns: int) -> Odometry:
-        """Return it as a measurement."""
+        """Return the record as a measurement at a stamp."""
         return Odometry("odometry", stamp_ns, self.speed_mps, self.yaw_rate_rad_s, pose=self._pose())
 
     def _pose(self) -> EgoPose | None:
@@ -76,14 +77,14 @@ class OdometryRecord:
 
 
 def read_odometry(path: Path | str) -> OdometryLog:
-    r"""Read CSV: time_s, speed_mps; optional yaw_rate_rad_s, and x_m, y_m, yaw_rad in the map.
+    r"""Read CSV with time_s, speed_mps; optional are yaw_rate_rad_s, and x_m, y_m, yaw_rad in the map.
 
-    Lines are sorted by their times; of several with one time the last counts. An optional cell may be empty.
+    Lines are sorted by time, and the last one of equal times is used. An optional cell may be empty.
 
     Raises
     ------
     InputFileError
-        If columns are missing, or a number is none or out of range; the message names the line.
+        If columns are missing, or a number is missing or out of range; the message contains the line number.
 
     Examples
     --------
@@ -110,7 +111,7 @@ def read_odometry(path: Path | str) -> OdometryLog:
 
 
 def _other_units(log: OdometryLog, turned_rad: float) -> Iterator[tuple[str, str]]:
-    """Yield columns whose numbers no vehicle has, and the unit in which it may have them."""
+    """Yield the columns with numbers that no vehicle can have, and their likely unit."""
     speeds = np.array([one.speed_mps for one in log.told])
     rates = np.array([one.yaw_rate_rad_s for one in log.told])
     if turned_rad > MOST_TURNED_RAD:
