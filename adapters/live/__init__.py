@@ -1,1 +1,1 @@
-"""Sensors as they run: microphones, cameras and detectors of one's own, and the time that all of it takes."""
+"""Live sensors: microphones, cameras and detectors, with latency and cost."""

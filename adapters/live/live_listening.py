@@ -1,6 +1,6 @@
-"""The whole chain on running sensors: one state a hop, its latency and its cost.
+"""The whole processing chain on live sensors: one state per hop, its latency and its cost.
 
-Latencies are kept as counts: a day takes no more memory than a minute.
+Latencies are stored as a histogram, whose memory does not grow with time.
 """
 
 import os
@@ -16,25 +16,25 @@ from worldstate.ground.errors import InvalidArgumentError, OwnPartError
 
 from .live_sound import LiveSound
 
-# Width of a count, seconds, and the largest latency that is told apart.
+# Bin width of the histogram and largest latency, seconds.
 _STEP_S, _LARGEST_S = 0.001, 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class LiveStep:
-    """One hop, as `Step` has it, and its age."""
+    """One hop as a `Step`, with its latency."""
 
     step: Step
     latency_s: float  # From the capture of the hop's last sample to the state
-    overruns: int  # Times that sound was lost up to now
-    lost_s: float  # Seconds of sound that were lost up to now
+    overruns: int  # Number of losses of sound so far
+    lost_s: float  # Seconds of sound lost so far
 
 
 def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[LiveStep]:
-    """Yield every hop of a source whose sound is a `LiveSound`, as soon as it is known.
+    """Yield every hop of a source whose sound is a `LiveSound`, as soon as it is available.
 
-    `hand_in` is called before every block of sound, for what other sensors have given, and returns how much
-    of it was refused; a call that fails, or returns something else, counts as one.
+    Each `hand_in` is called before every block of sound to deliver data of other sensors. It returns the
+    number of refused items; a call that fails, or returns something else, counts as one.
     """
     sound = source.sound
     if not isinstance(sound, LiveSound):
@@ -50,7 +50,7 @@ def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[
                 listener.refuse(one(listener))
             except OwnPartError:
                 raise
-            except Exception as error:  # of the caller's own function, which may raise anything
+            except Exception as error:  # the caller's function may raise anything
                 listener.refuse(1, "hand_in", f"fails is refused: {error!r}")
         listener.refuse(sound.refused - told)
         told = sound.refused
@@ -59,7 +59,7 @@ def live_steps(source: Source, *hand_in: Callable[[Listener], int]) -> Iterator[
 
 
 class LatencyMeter:
-    """Quantiles of the time from a hop's last sample to its state, to a millisecond.
+    """Quantiles of the time from a hop's last sample to its state, to 1 ms.
 
     Examples
     --------
@@ -74,11 +74,11 @@ class LatencyMeter:
         self._counts = np.zeros(round(_LARGEST_S / _STEP_S) + 1, dtype=np.int64)
 
     def add(self, latency_s: float) -> None:
-        """Count a state."""
+        """Add the latency of a state."""
         self._counts[min(max(round(latency_s / _STEP_S), 0), len(self._counts) - 1)] += 1
 
     def quantile_s(self, share: float) -> float | None:
-        """Return the smallest latency that so many of the states kept, None before the first."""
+        """Return the latency that this share of the states did not exceed; None before the first state."""
         total = int(self._counts.sum())
         if not total:
             return None
@@ -86,15 +86,16 @@ class LatencyMeter:
 
 
 class CostMeter:
-    """Measure what the process costs from now on."""
+    """Measure the resources that the process uses from now on."""
 
     def __init__(self) -> None:
         self._wall_s, self._cpu_s = time.monotonic(), time.process_time()
 
     def read(self) -> dict[str, float | None]:
-        """Return the time passed, the processor's time of all threads, its share of a core, and the load.
+        """Return elapsed time, CPU time of all threads, its share of one core, and the load.
 
-        The load is the number of processes that wanted to run, mean of the last minute; None where not known.
+        The load is the number of runnable processes, averaged over the last minute; None if it is not
+        available.
         """
         wall_s, cpu_s = time.monotonic() - self._wall_s, time.process_time() - self._cpu_s
         load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None

@@ -1,7 +1,7 @@
-"""Sensors that run beside the microphones, each read in a thread of its own.
+"""Sensors in addition to the microphones, each read in its own thread.
 
-UDP datagrams of other programs, detections image by image and odometry, each with its age; a camera of this
-machine, and what a detector finds in its images.
+These are UDP datagrams of other programs (detections per image, odometry), each with its age, and a camera of
+this computer with a detector.
 """
 
 import hmac
@@ -36,47 +36,48 @@ from .live_sound import BoundedChannel
 
 T = TypeVar("T")
 Sender: TypeAlias = tuple[str, int]
-# A second of images of a fast camera; what a stalled machine finds there beyond is too old to be of use.
+# One second of images of a fast camera; if the process stalls, older ones are useless.
 WAITING_DATAGRAMS = 64
-# The largest datagram that IP carries.
+# The largest UDP datagram over IP.
 _LARGEST_BYTES = 1 << 16
-# How soon a socket that is no longer listened to is noticed.
+# Longest delay before a reading thread notices that it was stopped.
 _POLL_S = 0.2
-# Nothing older than the lag of the filter is used.
+# The filter uses no data older than its lag.
 _OLDEST_S = 1e-9 * LAG_NS
-# By so much the clocks of a sensor and of its sender may differ: what comes from the future is of now.
+# Allowed difference between the clocks of a sensor and of its sender; a capture slightly in the future is
+# taken as now.
 _AHEAD_S = 0.05
-# A sender that has been silent for so long has ended: the next one takes its place.
+# After this silence a sender has ended, and another one may replace it.
 PINNED_S = 10.0
 
 
-# Between the time of sending that a datagram states and this machine's clock: clocks that NTP keeps differ by
-# milliseconds, and what was held back for longer would pass for fresh.
+# Largest difference between the sending time in a datagram and this computer's clock. Clocks with NTP differ
+# by milliseconds; a datagram delayed by an attacker for longer must not appear recent.
 CLOCKS_APART_S = 0.5
-# Asked of the kernel, which grants less where its limit is lower: what came while another thread computes.
+# Receive buffer for datagrams that arrive while another thread computes; the kernel may grant less.
 _KERNEL_BYTES = 1 << 22
 
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Whose datagrams a port takes: those of its first sender where neither addresses nor a key are given."""
+    """Whose datagrams a port accepts; without addresses and key, only those of the first sender."""
 
     allow: tuple[str, ...] = ()
     key: bytes | None = field(default=None, repr=False)
-    numbers: Mapping[str, int] = field(default_factory=dict)  # Taken last by each port, before this run
+    numbers: Mapping[str, int] = field(default_factory=dict)  # Last accepted per port before this run
 
 
 def signed(record: Mapping[str, object], key: bytes, port: str) -> bytes:
-    r"""Return a datagram of an object that a port with this key takes, once and now.
+    r"""Return a signed datagram that a port with this key accepts once, if it is sent now.
 
     Parameters
     ----------
     record : mapping of str to object
-        JSON-able; with ``"age_s"`` from capture to this call.
+        Values for JSON; ``"age_s"`` is the time from capture to this call.
     key : bytes
         The secret of ``--key``.
     port : str
-        Which takes it: ``odometry``, ``detections``, or ``detections/NAME`` where cameras have names.
+        Its port: ``odometry``, ``detections``, or ``detections/NAME`` for cameras with names.
 
     Examples
     --------
@@ -94,7 +95,7 @@ def _code(key: bytes, text: bytes) -> bytes:
 
 
 class ReaderThread(ABC):
-    """A thread that reads while the context lasts, and `close` at its end."""
+    """A thread that reads while its context is open; `close` is called at the end."""
 
     def __init__(self, close: Callable[[], object]) -> None:
         self._close, self._stopped = close, threading.Event()
@@ -117,37 +118,37 @@ class ReaderThread(ABC):
 class DatagramSocket(ReaderThread, Generic[T]):
     """Records that arrive as UDP datagrams of one JSON object, with ``"age_s"`` from capture to sending.
 
-    Where it has a ``"number"``, numbers must rise. With a key a line follows: the HMAC-SHA256 of the object
-    in hexadecimal digits. Then the number is due, which keeps a datagram from being sent again, and so are
-    ``"port"``, which keeps it from another one, and ``"sent_s"``, the Unix time, from being held back.
-    All of it is checked by the thread that reads: what is refused displaces nothing that waits.
+    If the object has a ``"number"``, numbers must increase. With a key, the HMAC-SHA256 of the object follows
+    as a line of hexadecimal digits, and three values are required: the number against replay, ``"port"``
+    against redirection to another port, and ``"sent_s"`` (Unix time) against delay. The reading thread checks
+    all of this, so that refused datagrams displace no waiting ones.
 
     Parameters
     ----------
     address : str
-        HOST:PORT to listen at.
+        HOST:PORT on which datagrams are received.
     stamp_ns : callable
-        From the time of capture to the stream's clock: `LiveSound.stamp_ns`.
+        Converts the time of capture to the stream's clock: `LiveSound.stamp_ns`.
     decode : callable
-        From the object without its age to what it stands for.
+        Converts the object without its age to a record.
     name : str
-        ``"port"`` of its datagrams: the option that named the address, and after a slash the camera.
+        ``"port"`` of its datagrams: the option of the address, followed by a slash and the camera's name.
     trust : Trust, optional
-        Whose datagrams are taken.
+        Whose datagrams are accepted.
 
     Attributes
     ----------
     refused : int
-        Datagrams that could not be read, came late, again, or from a stranger.
+        Number of datagrams that were unreadable, late, repeated, or of an unknown sender.
     problem : str
-        What was wrong with the last of them.
+        Cause of the last refusal.
     port : int
-        That is listened at, where 0 was given the one that was free.
+        Number of the port; if 0 was given, the free port that was chosen.
 
     Raises
     ------
     InvalidArgumentError
-        If the address is none, or taken.
+        If the address is invalid or in use.
     """
 
     def __init__(
@@ -162,7 +163,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
         self._decode, self._trust, self.name = decode, trust or Trust(), name
         self._records: BoundedChannel[tuple[float, T]] = BoundedChannel(WAITING_DATAGRAMS)
         self._pinned: tuple[float, Sender] | None = None
-        # The number taken last, by host; by a key there is one
+        # Number accepted last, by host; with a key there is only one.
         before = self._trust.numbers.get(name)
         self._last = {} if before is None else {"": before}
         super().__init__(self._socket.close)
@@ -171,18 +172,18 @@ class DatagramSocket(ReaderThread, Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """Datagrams that were not taken in time."""
+        """Number of datagrams that were not processed in time."""
         return self._records.dropped
 
     @property
     def numbers(self) -> dict[str, int]:
-        """The number that was taken last by a key, under the name of the port; empty before the first."""
+        """Last number accepted with a key, by the name of the port; empty before the first."""
         return {self.name: self._last[""]} if "" in self._last else {}
 
     def deliver(self, take: Callable[[int, T], None]) -> int:
-        """Pass on what waits, each with the time of its capture on the stream's clock, nanoseconds.
+        """Pass each waiting record to `take` with its time of capture on the stream's clock, nanoseconds.
 
-        What cannot be read, or is refused there, is counted; return how many were since the call before.
+        Return the number of records that were unreadable, or refused by `take`, since the last call.
         """
         for captured_s, told in self._records.take_all():
             try:
@@ -197,7 +198,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
             self.refused, self.problem = self.refused + 1, str(error)
 
     def _read_one(self, arrived_s: float, datagram: bytes, sender: Sender) -> tuple[float, T]:
-        """Return when a datagram's object was captured, and what it stands for."""
+        """Return the capture time and the record of a datagram."""
         pinned = self._check_sender(arrived_s, sender)
         try:
             record = decode_json(self._checked_text(datagram).decode(), "datagram")
@@ -213,7 +214,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
             last = self._last.get(source, -1)
             number = decode(int, number, "number")
             if number <= last:
-                raise InvalidArgumentError(f"number: expected one above {last}, taken already, got {number}")
+                raise InvalidArgumentError(f"number: expected more than the last one, {last}, got {number}")
         read = arrived_s - max(age_s, 0.0), self._decode(record)
         if number is not None:
             self._last[source] = number
@@ -221,7 +222,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
         return read
 
     def _check_sender(self, arrived_s: float, sender: Sender) -> tuple[float, Sender] | None:
-        """Return which sender is pinned from now on; refuse a stranger."""
+        """Return the sender accepted from now on; refuse any other."""
         if self._trust.allow:
             if sender[0] not in self._trust.allow:
                 allowed = ", ".join(self._trust.allow)
@@ -238,7 +239,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
         return arrived_s, sender
 
     def _checked_text(self, datagram: bytes) -> bytes:
-        """Return the object of a datagram, whose code is right where there is a key."""
+        """Return the object of a datagram; with a key, its code is verified."""
         if self._trust.key is None:
             return datagram
         text, _, code = datagram.rpartition(b"\n")
@@ -247,7 +248,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
         return text
 
     def _check_sent(self, port: object, sent_s: object) -> None:
-        """Refuse what was signed for another port, or was sent at another time."""
+        """Refuse a datagram that was signed for another port or not sent just now."""
         if port != self.name:
             raise InvalidArgumentError(f"port: expected {self.name!r}, got {port!r:.60}")
         late_s = time.time() - decode(float, sent_s, "sent_s")
@@ -260,7 +261,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
         while not self._stopped.is_set():
             try:
                 datagram, sender = self._socket.recvfrom(_LARGEST_BYTES)
-            except OSError:  # nothing came, or what the system says of a datagram sent before
+            except OSError:  # a time-out, or an error report for an earlier datagram
                 continue
             try:
                 self._records.put(self._read_one(time.monotonic(), datagram, sender))
@@ -269,10 +270,10 @@ class DatagramSocket(ReaderThread, Generic[T]):
 
 
 class DetectionSocket(DatagramSocket[DetectionFrame]):
-    """Looks of another program's detector: OVAD's record of one image, and the age of the image when sent.
+    """Detections of another program: OVAD's record of one image, with the age of the image when sent.
 
-    ``{"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}``; an image
-    without detections is sent, too: it was searched. A datagram that is lost is an image not asked.
+    ``{"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}``. An image
+    without detections must be sent too, because it was searched. The image of a lost datagram is unqueried.
     """
 
     def __init__(
@@ -283,11 +284,11 @@ class DetectionSocket(DatagramSocket[DetectionFrame]):
 
 
 class OdometrySocket(DatagramSocket[OdometryRecord]):
-    """Odometry of a running vehicle, for `Listener.add`.
+    """Odometry of a driving vehicle, for `Listener.add`.
 
-    ``{"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}``, with a localiser "x_m", "y_m" and "yaw_rad"
-    in the map, too. The last one holds until the next. The filter puts what is up to two seconds late where
-    it belongs.
+    ``{"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}``; a localiser adds "x_m", "y_m" and "yaw_rad"
+    in the map. The last record is valid until the next. The filter inserts a record that is up to 2 s late at
+    its time.
     """
 
     def __init__(self, address: str, stamp_ns: Callable[[float], int], trust: Trust | None = None) -> None:
@@ -303,47 +304,48 @@ def _bound_socket(address: str, option: str) -> socket.socket:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
     try:
         listening.bind(target)
-    except (OSError, TypeError, UnicodeError) as error:  # of a host, too, that is no name
+    except (OSError, TypeError, UnicodeError) as error:  # also for an invalid host name
         listening.close()
         problem = f"expected a free address, got {address} ({error})"
         raise InvalidArgumentError(f"{option}: {problem}") from error
     return listening
 
 
-# Images that wait at most: a detector that is slower than the camera looks at the newest ones.
+# Largest number of waiting images; a detector slower than the camera processes the newest ones.
 WAITING_IMAGES = 4
 
 StampedImages = BoundedChannel[tuple[float, ImageArray]]
 
 
 def image_channel() -> StampedImages:
-    """Return a channel of images, each with its time of capture on the clock of `time.monotonic`."""
+    """Return a channel of images, each with its capture time on the clock of `time.monotonic`."""
     return BoundedChannel(WAITING_IMAGES)
 
 
 class ImageLooks:
-    """What a detector finds in the images of a channel.
+    """Detections of a detector in the images of a channel.
 
     Parameters
     ----------
     images : StampedImages
-        Filled by a `CameraFeed`, or by a callback of one's own.
+        Filled by a `CameraFeed` or your own callback.
     detector : Detector
-        Looks at them in the order of time.
+        Processes the images in the order of time.
     stamp_ns : callable
-        From the time of capture to the stream's clock: `LiveSound.stamp_ns`.
+        Converts the time of capture to the stream's clock: `LiveSound.stamp_ns`.
     size_px : (int, int)
-        Width and height that the lens was given for.
+        Width and height of the images for which the lens was specified.
     rates : MissRates, optional
-        Where they hold the camera's scale of health, its degradation is read from the images.
+        If they contain the camera's health scale, its degradation is estimated from the images.
 
     Attributes
     ----------
     refused : int
-        Images of another size or none, those at which the detector failed or gave no `DetectionFrame`, and
-        those whose boxes were refused. Only a part that an installed package brings ends the run.
+        Number of images that had another size or were invalid, on which the detector failed or did not return
+        a `DetectionFrame`, or whose boxes were refused. Only a detector from an installed plug-in ends the
+        run.
     problem : str
-        What was wrong with the last of them.
+        Cause of the last refusal.
     """
 
     def __init__(
@@ -359,9 +361,9 @@ class ImageLooks:
         self.refused, self.problem = 0, ""
 
     def deliver(self, take: Callable[[int, DetectionFrame], None]) -> int:
-        """Pass on, such as to `Listener.look`, what is found in the images that wait, each with its stamp.
+        """Pass the detections of each waiting image with its stamp to `take`, such as `Listener.look`.
 
-        Return how many were refused.
+        Return the number of refused images.
         """
         before = self.refused
         for waiting in self._waiting():
@@ -377,28 +379,28 @@ class ImageLooks:
         return self.refused - before
 
     def _waiting(self) -> list[tuple[float, ImageArray]]:
-        """Return the images that wait; what ended the camera counts once."""
+        """Return the waiting images; a failure of the camera counts as one refusal."""
         try:
             return self._images.take_all()
-        except Exception as error:  # whatever the callback that fills the channel ended it with
+        except Exception as error:  # the callback that fills the channel may end it with any error
             if (problem := f"camera: expected images, got {error!r}") != self.problem:
                 self.refused, self.problem = self.refused + 1, problem
             return []
 
     def _found(self, stamp_ns: int, image: ImageArray) -> DetectionFrame:
-        """Return what the detector finds in an image that has the size of the lens."""
+        """Return the detections in an image of the lens's size."""
         try:
             self._check_size(image)
             self._health.read(stamp_ns, image)
             found: object = self._detector.detect(image)
         except WorldstateError:
             raise
-        except Exception as error:  # of the caller's own detector, which may raise anything
+        except Exception as error:  # the caller's detector may raise anything
             raise InvalidArgumentError(f"camera: expected a detector that works, got {error!r}") from error
         return checked_frame("camera", found)
 
     def degradation(self, stamp_ns: int) -> float:
-        """Return d as last read, 0 where no scale of health is known."""
+        """Return the latest d, 0 without a health scale."""
         return self._health.level
 
     def _check_size(self, image: ImageArray) -> None:
@@ -407,19 +409,19 @@ class ImageLooks:
         got = image.shape[1], image.shape[0]
         if got != self._size_px:
             width, height = self._size_px
-            problem = f"expected images of {width} x {height} px as its lens, got {got[0]} x {got[1]}"
+            problem = f"expected images of the lens's {width} x {height} px, got {got[0]} x {got[1]}"
             raise InvalidArgumentError(f"--camera: {problem}: give the lens of this camera")
 
 
 class CameraFeed(ReaderThread):
-    """Read a camera of this machine into a channel until it is stopped.
+    """Read a camera of this computer into a channel until it is stopped.
 
     Parameters
     ----------
     device : int
-        Number of the camera as OpenCV counts them.
+        Number of the camera in OpenCV.
     images : StampedImages
-        Where the images go. While the camera gives none, it is asked again, until the end.
+        Channel for the images. If the camera gives none, it is tried again until the end.
 
     Raises
     ------
@@ -434,7 +436,7 @@ class CameraFeed(ReaderThread):
         self._images = images
         if not self._capture.isOpened():
             self._capture.release()
-            raise InputFileError(f"camera {device}", "expected a camera of this machine, it cannot be opened")
+            raise InputFileError(f"camera {device}", "expected a camera, but it cannot be opened")
         super().__init__(self._capture.release)
 
     def _read(self) -> None:

@@ -1,4 +1,4 @@
-"""Sound as it comes, from microphones or a recording played in their place; lost blocks become zeros."""
+"""Live sound from microphones or a replayed recording; lost blocks are replaced by zeros."""
 
 import logging
 import threading
@@ -28,18 +28,18 @@ T = TypeVar("T")
 class BoundedChannel(Generic[T]):
     """Queue of limited length between two threads.
 
-    A sensor cannot wait: when what it gives is not taken, the oldest item makes room for the newest, because
-    the state is about now. Every item lost is counted.
+    A sensor cannot wait. If the channel is full, the newest item replaces the oldest, because the state
+    describes the present. Lost items are counted.
 
     Parameters
     ----------
     capacity : int
-        Largest number of items that wait, >= 1.
+        Largest number of waiting items, >= 1.
 
     Attributes
     ----------
     dropped : int
-        Items that were lost because they were not taken in time.
+        Number of items lost because they were not taken in time.
 
     Raises
     ------
@@ -63,7 +63,7 @@ class BoundedChannel(Generic[T]):
         self.dropped = 0
 
     def put(self, item: T) -> None:
-        """Hand an item over; never waits. After the end nothing is taken any more."""
+        """Add an item without waiting; after `close` it is ignored."""
         with self._changed:
             if self._closed:
                 return
@@ -72,12 +72,12 @@ class BoundedChannel(Generic[T]):
             self._changed.notify()
 
     def take(self, wait_s: float | None = None) -> T | None:
-        """Wait for the oldest item and return it; None once the channel is closed and empty.
+        """Wait for the oldest item and return it; None if the channel is closed and empty.
 
         Raises
         ------
         TimeoutError
-            If nothing came for so many seconds.
+            If no item arrived within `wait_s` seconds.
         """
         with self._changed:
             if not self._changed.wait_for(lambda: self._items or self._closed, wait_s):
@@ -89,11 +89,11 @@ class BoundedChannel(Generic[T]):
 
     @property
     def ended(self) -> bool:
-        """Whether it is closed and empty."""
+        """Whether the channel is closed and empty."""
         return self._closed and not self._items
 
     def take_all(self) -> list[T]:
-        """Return all that waits, the oldest first, without waiting."""
+        """Return all waiting items, oldest first, without waiting."""
         with self._changed:
             taken = list(self._items)
             self._items.clear()
@@ -102,7 +102,7 @@ class BoundedChannel(Generic[T]):
             return taken
 
     def take_newest(self, taken: T) -> T:
-        """Return the newest item that waits, or `taken` if none does; what it passes over is dropped."""
+        """Return the newest waiting item and drop the others; return `taken` if none waits."""
         with self._changed:
             self.dropped += len(self._items)
             newest = self._items.pop() if self._items else taken
@@ -110,7 +110,7 @@ class BoundedChannel(Generic[T]):
             return newest
 
     def close(self, error: BaseException | None = None) -> None:
-        """Say that nothing more comes; an error is raised where it is taken, once nothing waits."""
+        """End the channel; an error is raised in the thread that takes, after the last item."""
         with self._changed:
             self._closed = True
             self._error = self._error or error
@@ -121,25 +121,26 @@ class BoundedChannel(Generic[T]):
             raise self._error
 
 
-# Blocks a second that a source gives. The state of a hop that ends within one waits for its end: at most
-# 25 ms, and not at all where hops are whole blocks, as at 48 kHz.
+# Blocks per second of a source. The state of a hop that ends within a block waits for its end: at most 25 ms,
+# and not at all if hops are whole blocks, as at 48 kHz.
 BLOCKS_PER_SECOND = 40
-# Seconds of sound that wait at most. A short stall of the machine is made up for; a state that comes later
-# than this is no warning, and what is older is dropped.
+# Largest waiting time of sound. A short stall of the process is made up for; sound that waits longer is
+# dropped, because a later state is no warning.
 LONGEST_WAIT_S = 2.0
-# So much of lost sound is heard as silence, and up to a hop more: a window in which the snapshot says that
-# samples were lost, and not yet that microphones are dead. Silence takes as long to hear as sound, so that a
-# machine that is too slow would fall behind by all that it loses. Of a longer gap the rest is left out, and
-# with it all that waits: what follows is heard in one piece.
+# Duration up to which (plus at most one hop) lost sound is replaced by silence: a window that the snapshot
+# reports as lost samples, but not yet as dead microphones. Silence takes as long to process as sound, so a
+# slow computer would fall behind by all it loses. The rest of a longer gap is left out together with all
+# waiting blocks, so that the sound after it is continuous.
 HEARD_SILENCE_S = 0.9
-# A longer gap is no lost block but a device that slept.
+# A longer gap is no loss; the device was asleep.
 LONGEST_GAP_S = 60.0
-# A device that has given nothing for so long has stalled; with the hop its state is out within a second.
+# After this time without data a device has stalled; with one hop more, the state is published within 1 s.
 STALL_S = 0.5
-# Of full scale. A converter gives at most 1, and single precision squares and adds up this without overflow.
+# Relative to full scale. A converter gives at most 1, and single precision sums squares up to this without
+# overflow.
 LARGEST_SAMPLE = 1000.0
-# 24 bits are what converters of such arrays give. WAV ends at 4 GiB, nine minutes of 56 channels; RF64 does
-# not, and readers of the one read the other.
+# Converters of such arrays have 24 bits. WAV ends at 4 GiB, which is nine minutes of 56 channels; RF64 has no
+# such limit and is read by WAV readers.
 _FORMAT, _SUBTYPE = "RF64", "PCM_24"
 # SFC_SET_UPDATE_HEADER_AUTO of libsndfile.
 _UPDATE_HEADER = 0x1061
@@ -150,17 +151,17 @@ class SoundBlock:
     """Samples that were captured together."""
 
     samples: Float32Array  # Shape (n, M), full scale 1
-    first: int  # Number of the first of them since the start, lost ones counted
-    captured_s: float  # When the last of them was captured, on the clock of `time.monotonic`
+    first: int  # Number of the first sample since the start, including lost ones
+    captured_s: float  # Capture time of the last sample on the clock of `time.monotonic`
 
 
 NO_SOUND = SoundBlock(np.zeros((0, 0), np.float32), 0, 0.0)
-# Of `time.monotonic`, which begins at a boot: beyond is no time, and its nanoseconds overflow.
+# Largest time of `time.monotonic`, which starts at boot; beyond it nanoseconds overflow.
 _LATEST_S = 1e9
 
 
 def block_samples(sample_rate_hz: int) -> int:
-    """Return the length of a block, rounded up: shorter ones would end just before the hops do.
+    """Return the length of a block, rounded up, because shorter ones would end just before the hops.
 
     Examples
     --------
@@ -171,7 +172,7 @@ def block_samples(sample_rate_hz: int) -> int:
 
 
 class SoundFeed(Protocol):
-    """Microphones, or what stands for them: gives blocks from a thread of its own until it is stopped.
+    """Interface of microphones or a replacement: it gives blocks from its own thread until stopped.
 
     Examples
     --------
@@ -189,68 +190,69 @@ class SoundFeed(Protocol):
     name: str
     sample_rate_hz: int
     channels: int
-    speed: float  # Seconds of sound a second: 1 for microphones
-    overflows: int  # Times that the source lost samples before they were blocks
+    speed: float  # Seconds of sound per second: 1 for microphones
+    overflows: int  # Number of times that samples were lost before they formed blocks
 
     def start(self, into: BoundedChannel[SoundBlock], /) -> None:
-        """Begin to put blocks into the channel."""
+        """Start to put blocks into the channel."""
 
     def stop(self) -> None:
-        """Put nothing more, and close what was opened."""
+        """Stop giving blocks, and close what was opened."""
 
 
 class LiveSound(Audio):
-    """A running source as a recording that has no end yet: what `open_source` and `listen_steps` take.
+    """A live source as a recording without end, for `open_source` and `listen_steps`.
 
     Parameters
     ----------
     feed : SoundFeed
-        Gives the blocks.
+        Source of the blocks.
     keep : callable, optional
-        Called with every block, lost ones as zeros. Without it no sound outlives the window it is heard in.
+        Called with every block, with zeros for lost ones. Without it no sound is kept longer than a window.
 
     Attributes
     ----------
     start_ns : int
-        Time of the first sample on the stream's clock: not 0 where a belief is resumed. Later by what was
-        left out of the sound since.
+        Time of the first sample on the stream's clock; not 0 if a belief is resumed. It increases by the
+        sound that was left out.
     lost_samples : int
-        Samples a channel that were lost on the way; `blocks` gave zeros for a second of each gap at most.
+        Number of lost samples per channel; `blocks` gave zeros for at most 1 s of each gap.
     refused : int
-        Blocks of another shape, repeated, or numbered back or far ahead, and blocks in which samples were no
-        numbers or impossible ones, which are zeros in what `blocks` gave.
+        Number of blocks of another shape, or with a repeated, decreasing or far larger number, and of blocks
+        with invalid or impossible samples, which `blocks` replaced by zeros.
     """
 
     def __init__(self, feed: SoundFeed, keep: Callable[[Float32Array], None] | None = None) -> None:
         self.path, self.frames = Path(feed.name), 0
         self.sample_rate_hz, self.channels = feed.sample_rate_hz, feed.channels
-        # Known only after a second; the front-end leaves out a channel that is silent.
+        # Silence is detected only after 1 s; the front-end excludes a silent channel.
         self.silent_channels = ()
         self.lost_samples, self.start_ns, self.refused = 0, 0, 0
         self._feed, self._keep = feed, keep
         self._channel: BoundedChannel[SoundBlock] = BoundedChannel(int(LONGEST_WAIT_S * BLOCKS_PER_SECOND))
         self._captured_s = time.monotonic()
-        # What a block's number is behind that of the stream: grows where a device stalls; None while it does.
+        # Offset from a block's number to that of the stream: it grows if the device stalls, and is None
+        # during a stall.
         self._behind: int | None = 0
 
     @property
     def overruns(self) -> int:
-        """Times that sound was lost: blocks that were not taken in time, and overflows of the device."""
+        """Number of times that sound was lost: blocks not taken in time, and overflows of the device."""
         return self._channel.dropped + self._feed.overflows
 
     @property
     def lost_s(self) -> float:
-        """Seconds of sound that were lost."""
+        """Seconds of lost sound."""
         return self.lost_samples / self.sample_rate_hz
 
     def check_size(self, expect_channels: int | None) -> None:
-        """Refuse another number of channels than microphones; how long it will be is not known."""
+        """Refuse another number of channels than microphones; the length is not known."""
         self.check_channels(expect_channels)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
         """Yield the sound from now until the source ends or is closed, in blocks of the source's length.
 
-        While a device stalls, zeros take the place of its sound.
+        If the device stalls, its sound is replaced by zeros.
         """
         self._feed.start(self._channel)
         self._captured_s = accepted_s = time.monotonic()
@@ -287,30 +289,30 @@ class LiveSound(Audio):
             self._feed.stop()
 
     def close(self) -> None:
-        """Let `blocks` end after what waits; may be called from any thread and from a signal handler."""
+        """End `blocks` after the waiting blocks; may be called from any thread or a signal handler."""
         self._channel.close()
 
     def age_s(self, sample: int) -> float:
-        """Return how long ago a sample of the last block was captured, seconds of the clock."""
+        """Return how long ago a sample of the last block was captured, seconds."""
         behind_s = (self.frames - sample) / (self.sample_rate_hz * self._feed.speed)
         return time.monotonic() - self._captured_s + behind_s
 
     def stamp_ns(self, captured_s: float) -> int:
-        """Return the time on the stream's clock of an instant of `time.monotonic`.
+        """Convert a time of `time.monotonic` to the stream's clock.
 
-        The last block ties the two clocks together: a converter that is wrong by 50 ppm would be four seconds
-        late after a day.
+        The last block links the two clocks, because a converter that is wrong by 50 ppm would be off by 4 s
+        after a day.
         """
         since_s = (captured_s - self._captured_s) * self._feed.speed
         return self.start_ns + nanoseconds(self.frames / self.sample_rate_hz + since_s)
 
     def _missing(self, block: SoundBlock) -> int:
-        """Return how many samples are missing between what was given and a block."""
-        # What the device counts after a stall says nothing of the time before.
+        """Return the number of samples missing between the last sample and a block."""
+        # After a stall the device's numbers are unrelated to the earlier ones.
         return 0 if self._behind is None else block.first + self._behind - self.frames
 
     def _checked(self, given: object) -> SoundBlock:
-        """Return a block that a feed gave; count what is no block of these microphones, None too."""
+        """Return a valid block of a feed; count and replace anything else, also None."""
         if isinstance(given, SoundBlock):
             samples, first, captured_s = given.samples, given.first, given.captured_s
             known = isinstance(first, int | np.integer) and isinstance(captured_s, Real)
@@ -322,8 +324,8 @@ class LiveSound(Audio):
         return NO_SOUND
 
     def _fits(self, block: SoundBlock) -> bool:
-        """Return whether a block is the next one of the stream; count it where it is not."""
-        # Zeros already stand for what a device has held back while it stalled.
+        """Return whether a block continues the stream; count it if not."""
+        # Sound that a device held back during a stall has already been replaced by zeros.
         late = self._behind is None and block.captured_s <= self._captured_s
         if late or not 0 <= self._missing(block) <= LONGEST_GAP_S * self.sample_rate_hz:
             self.refused += 1
@@ -333,15 +335,15 @@ class LiveSound(Audio):
         return True
 
     def _sound(self, block: SoundBlock) -> Iterator[Float32Array]:
-        """Yield a block that fits, after zeros for what was lost before it."""
+        """Yield a block that continues the stream, after zeros for the sound lost before it."""
         yield from self._zeros(self._missing(block))
         usable = np.abs(block.samples) <= LARGEST_SAMPLE
         self.refused += not usable.all()
-        # Only where it is: a microphone that gives no numbers is one that is silent, and the others hear.
+        # Zero only the unusable samples, so that a faulty microphone is silent and the others are still used.
         yield block.samples if usable.all() else np.where(usable, block.samples, np.float32(0.0))
 
     def _zeros(self, missing: int) -> Iterator[Float32Array]:
-        """Yield zeros, a second at most, in place of what was lost; by the rest the stream begins later."""
+        """Yield zeros, at most 1 s, for lost sound; the rest is added to the start time of the stream."""
         self.lost_samples += missing
         # Whole hops, so that stamps stay on their grid.
         hops = max(int(HOP_RATE_HZ * (missing / self.sample_rate_hz - HEARD_SILENCE_S)), 0)
@@ -361,7 +363,7 @@ class LiveSound(Audio):
 def kept_sound(
     path: Path | None, sample_rate_hz: int, channels: int
 ) -> Iterator[Callable[[Float32Array], None] | None]:
-    """Lend a function that writes blocks to a file that reads at any time; None without a path."""
+    """Yield a function that writes blocks to a file that is readable at any time; None without a path."""
     if path is None:
         yield None
         return
@@ -373,7 +375,7 @@ def kept_sound(
             raw.fileno(), "w", sample_rate_hz, channels, _SUBTYPE, format=_FORMAT, closefd=False
         ) as file,
     ):
-        # The length in the header follows every block: soundfile has no function of its own for it.
+        # Update the length in the header after every block; soundfile has no function for it.
         soundfile._snd.sf_command(file._file, _UPDATE_HEADER, soundfile._ffi.NULL, 1)
 
         whole = True
@@ -395,12 +397,12 @@ def kept_sound(
         yield write
 
 
-# Lost samples are told from the jitter of a callback's time by this share of a block.
+# A lateness above this share of a block means lost samples, below it jitter of the callback.
 _LOST_SHARE = 0.5
 
 
 class MissingPortAudioError(WorldstateError):
-    """The package sounddevice is installed, the system's library PortAudio is not."""
+    """The package sounddevice is installed, but not the system's library PortAudio."""
 
 
 def portaudio() -> Any:
@@ -409,38 +411,38 @@ def portaudio() -> Any:
     Raises
     ------
     MissingExtraError
-        If it is not installed.
+        If the package is not installed.
     MissingPortAudioError
-        If it finds no PortAudio library.
+        If the PortAudio library is not found.
     """
     try:
         return optional("sounddevice")
     except OSError as error:
         raise MissingPortAudioError(
-            "expected the system's library PortAudio, found none: install it "
+            "expected the system's library PortAudio, but it is missing: install it "
             "(Debian, Ubuntu: apt-get install libportaudio2; Fedora: dnf install portaudio; "
             "macOS and Windows: it comes with sounddevice)"
         ) from error
 
 
 class PortAudioInput:
-    """The first channels of an input device, one a microphone.
+    """The first channels of an input device, one per microphone.
 
     Parameters
     ----------
     channels : int
         Number of microphones.
     sample_rate_hz : int
-        Samples a second.
+        Samples per second.
     device : int or str, optional
-        Number or part of the name of the device; the system's default input where not given.
+        Number of the device or part of its name; by default the system's input.
 
     Raises
     ------
     MissingExtraError, MissingPortAudioError
         If sounddevice or PortAudio is not installed.
     InvalidArgumentError
-        If there is no such device, or it has not so many channels or not that rate.
+        If there is no such device, or it has too few channels or not this sample rate.
     """
 
     def __init__(self, channels: int, sample_rate_hz: int, device: int | str | None = None) -> None:
@@ -454,7 +456,7 @@ class PortAudioInput:
         self._begun_s: float | None = None
 
     def start(self, into: BoundedChannel[SoundBlock], /) -> None:
-        """Open the device and begin to record."""
+        """Open the device and start to record."""
 
         def on_block(samples: Float32Array, frames: int, times: Any, status: Any) -> None:
             into.put(self._block(samples, times, status))
@@ -475,21 +477,21 @@ class PortAudioInput:
             self._stream.close()
 
     def _block(self, samples: Float32Array, times: Any, status: Any) -> SoundBlock:
-        """Stamp what the device gave; the array is PortAudio's own and is overwritten after the call."""
+        """Stamp and copy a block, because PortAudio overwrites its array after the call."""
         now_s, taken_s = time.monotonic(), times.inputBufferAdcTime
         length_s = len(samples) / self.sample_rate_hz
         if status.input_overflow:
             self.overflows += 1
             self._next += self._lost(taken_s, length_s)
         first, self._next = self._next, self._next + len(samples)
-        # Some drivers give no capture time; then the block is as old as the call.
+        # Some drivers give no capture time; then the time of the call is used.
         age_s = max(times.currentTime - taken_s - length_s, 0.0) if taken_s else 0.0
         if taken_s:
             self._begun_s = taken_s - first / self.sample_rate_hz
         return SoundBlock(samples.copy(), first, now_s - age_s)
 
     def _lost(self, taken_s: float, length_s: float) -> int:
-        """Return how many samples an overflow has cost, by the time of the first one after it."""
+        """Return the number of samples lost in an overflow, from the time of the first sample after it."""
         if not taken_s or self._begun_s is None:
             return 0
         lost_s = taken_s - self._begun_s - self._next / self.sample_rate_hz
@@ -514,19 +516,20 @@ class PortAudioInput:
 
 
 class Playback:
-    """Give the blocks of a recording at the times at which a converter would.
+    """Replay the blocks of a recording at the times of a converter.
 
-    A block counts as captured when its last sample is due, so that a late player shows as latency.
+    The capture time of a block is the time at which its last sample is due, so that a late player appears as
+    latency.
 
     Parameters
     ----------
     audio : Audio
-        The recording; closed with the playback.
+        The recording, which is closed with the playback.
     speed : float
-        Seconds of sound a second, in [0.1, 100].
+        Seconds of sound per second, in [0.1, 100].
     duration_s : float, optional
-        Seconds of sound after which it ends; a recording that is shorter is played again from its start.
-        Its own length where not given.
+        Seconds of sound after which the playback ends; a shorter recording is repeated. By default the
+        recording is played once.
     """
 
     def __init__(self, audio: Audio, speed: float = 1.0, duration_s: float | None = None) -> None:
@@ -540,12 +543,12 @@ class Playback:
         self._thread: threading.Thread | None = None
 
     def start(self, into: BoundedChannel[SoundBlock], /) -> None:
-        """Begin to play."""
+        """Start to play."""
         self._thread = threading.Thread(target=self._play, args=(into,), daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End, and close the recording."""
+        """Stop, and close the recording."""
         self._stopped.set()
         if self._thread is not None:
             self._thread.join()
@@ -561,7 +564,7 @@ class Playback:
                 if self._stopped.wait(max(due_s - time.monotonic(), 0.0)):
                     break
                 into.put(SoundBlock(samples, sent - len(samples), due_s))
-        except Exception as failure:  # it is raised where the blocks are taken
+        except Exception as failure:  # raised where the blocks are taken
             error = failure
         into.close(error)
 

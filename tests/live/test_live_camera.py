@@ -154,7 +154,7 @@ def test_images_of_another_camera_are_refused(source):
         images.put((0.0, np.zeros((height, width, 3), np.uint8)))
     looks = ImageLooks(images, Counting(), nanoseconds, (640, 480))
     assert looks.deliver(source.camera_channel().see) == looks.refused == 1
-    assert "expected images of 640 x 480 px as its lens, got 1280 x 720" in looks.problem
+    assert "expected images of the lens's 640 x 480 px, got 1280 x 720" in looks.problem
 
 
 def test_a_box_outside_the_image_is_refused_and_the_next_one_counts(source):
