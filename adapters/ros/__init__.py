@@ -1,1 +1,1 @@
-"""ROS 2 bags without ROS: sound, detections and odometry in, world-states out."""
+"""ROS 2 bags without ROS: read sound, detections and odometry, write world-states."""

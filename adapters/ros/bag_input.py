@@ -1,4 +1,4 @@
-"""Bags of ROS 2 read: their topics, and the sound, array, detections and speed of the ego that they hold."""
+"""Reader of ROS 2 bags: topics, sound, array, detections and speed of the ego."""
 
 import io
 import logging
@@ -30,15 +30,15 @@ from . import message_types as types
 from .message_types import instant_of, stamp_of, typestore
 from .sample_clock import begins_again, contradiction, lost_before
 
-# What may mend a file of each storage.
+# Commands that may repair a file of each storage.
 _MENDED = {".mcap": MCAP_MENDED, ".db3": "`sqlite3 IN .recover | sqlite3 OUT`"}
 METADATA_NAME, STORAGE_SUFFIXES = "metadata.yaml", tuple(_MENDED)
-# Half a second of a thousand microphones; an image of detections is far below it.
+# Half a second of 1,000 microphones; the detections of an image are far smaller.
 MAX_MESSAGE_BYTES = 64 << 20
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path names a bag: its folder, or one of its storage files.
+    """Return whether a path is a bag: its folder, or one of its storage files.
 
     Examples
     --------
@@ -51,7 +51,7 @@ def is_bag(path: Path) -> bool:
 
 
 def _storage_of(path: Path) -> list[Path]:
-    """Return what is opened of a bag: its folder or file, and the files of a folder without metadata."""
+    """Return the paths to open for a bag: its folder or file, or the files of a folder without metadata."""
     files = [] if (path / METADATA_NAME).is_file() else [path.glob(f"*{kind}") for kind in STORAGE_SUFFIXES]
     return sorted(one for found in files for one in found) or [path]
 
@@ -64,16 +64,16 @@ class BagReader:
     reader: Any  # rosbags' own
 
     def count(self, topic: str) -> int:
-        """Return how many messages a topic holds, as the bag says."""
+        """Return the number of messages on a topic, from the bag's metadata."""
         return sum(int(one.msgcount) for one in self.reader.connections if one.topic == topic)
 
     def topic(self, option: str, given: str | None, *kinds: str) -> str | None:
-        """Return the topic that holds messages of one of these types; None where there is none.
+        """Return the topic with messages of one of these types; None if there is none.
 
         Raises
         ------
         InputFileError
-            If the topic that was given is not there, or several would do and none was given.
+            If the given topic is missing, or none was given and several fit.
         """
         found = {one.topic: one.msgtype for one in self.reader.connections}
         fit = sorted(topic for topic, kind in found.items() if kind in kinds)
@@ -90,7 +90,7 @@ class BagReader:
         return next(str(one.msgtype) for one in self.reader.connections if one.topic == topic)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield the messages of a topic, each with the time at which it was recorded, ns."""
+        """Yield the messages of a topic, each with its time of recording, ns."""
         chosen = [one for one in self.reader.connections if one.topic == topic]
         with refused_as_bag(self.path):
             for connection, recorded_ns, data in self.reader.messages(chosen):
@@ -100,21 +100,21 @@ class BagReader:
                 yield recorded_ns, self.reader.deserialize(data, connection.msgtype)
 
     def told(self) -> str:
-        """Return the topics and their types, for messages."""
+        """Return the topics and their types, for error messages."""
         found = sorted(f"{one.topic} ({one.msgtype})" for one in self.reader.connections)
         return ", ".join(found) or "no topic at all"
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[BagReader]:
-    """Lend a bag.
+    """Open a bag for the duration of the context.
 
     Raises
     ------
     InputFileError
-        If there is none, or it is damaged.
+        If there is no bag, or it is damaged.
     MissingExtraError
-        Without rosbags.
+        If rosbags is not installed.
     """
     store = typestore()
     from rosbags.highlevel import AnyReader
@@ -127,7 +127,7 @@ def open_bag(path: Path) -> Iterator[BagReader]:
                 check_chunks(file)
         if (metadata := path / METADATA_NAME).is_file():
             _check_packing(metadata, metadata.stat().st_mtime_ns)
-        # Bags of before ROS 2 Iron hold no definitions; then those that ship here count.
+        # Bags from before ROS 2 Iron have no definitions; the definitions that ship here are used for them.
         reader = AnyReader(_storage_of(path), default_typestore=store)
         reader.open()
     try:
@@ -136,32 +136,32 @@ def open_bag(path: Path) -> Iterator[BagReader]:
         reader.close()
 
 
-@lru_cache(maxsize=8)  # a bag is opened several times in a run, and its reader parses the file each time
+@lru_cache(maxsize=8)  # a run opens a bag several times, and the reader parses the file each time
 def _check_packing(metadata: Path, modified_ns: int) -> None:
-    """Refuse a bag whose files or messages are compressed: its reader decodes them without a bound."""
+    """Refuse a bag with compressed files or messages, because its reader decodes them without a limit."""
     about = optional("ruamel.yaml").YAML(typ="safe").load(read_text(metadata, "metadata", MAX_BYTES))
     mode = about["rosbag2_bagfile_information"].get("compression_mode") or "none"
     if mode.lower() != "none":
-        problem = f"expected a bag that is compressed by chunks of MCAP or not at all, got by {mode:.20}"
+        problem = f"expected a bag compressed by chunks of MCAP or not at all, got compression by {mode:.20}"
         raise InputFileError(metadata.parent, f"{problem}: `ros2 bag convert` writes one")
 
 
 @contextmanager
 def refused_as_bag(path: Path) -> Iterator[None]:
-    """Turn whatever is wrong with a bag into one error that names it."""
+    """Convert any failure on a bag to one error with its name."""
     try:
         yield
     except WorldstateError:
         raise
-    # A damaged bag fails in SQLite, YAML, struct, zstd or numpy, each with errors of its own; a length
-    # that was spoiled asks for more memory than there is.
+    # A damaged bag may raise errors of SQLite, YAML, struct, zstd or numpy; a corrupt length may exhaust the
+    # memory.
     except Exception as error:
         said = " ".join(str(error).split()) or type(error).__name__
         if "rofile" in said:  # An MCAP file of another program, such as `run --export mcap=FILE`
             said += "; `worldstate log replay` reads files of snapshots"
         kind = ".db3" if path.suffix == ".db3" or any(path.glob("*.db3")) else ".mcap"
-        way_on = f"{_MENDED[kind]} may save a file that was cut, `ros2 bag reindex` a folder"
-        problem = f"expected a bag of ROS 2 that can be read ({said:.200}); {way_on}"
+        way_on = f"{_MENDED[kind]} may save a truncated file, `ros2 bag reindex` a folder"
+        problem = f"expected a readable bag of ROS 2 ({said:.200}); {way_on}"
         raise InputFileError(path, problem) from error
 
 
@@ -169,7 +169,7 @@ _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 
 AUDIO_KINDS = types.AUDIO, types.STAMPED_PCM, types.PCM, types.AUDIO_FRAME, types.RAW_AUDIO
-# Formats by the message that names them; a compressed one has lost the phase between microphones.
+# Formats by message type; compressed formats are refused, because they lose the phase between microphones.
 _ENCODED: tuple[Encoding, ...] = get_args(Encoding)
 _FRAMES = "signed_16", "signed_24", "signed_padded_24", "signed_32", "float"
 ENCODINGS: dict[str, dict[str, Encoding]] = {
@@ -178,16 +178,16 @@ ENCODINGS: dict[str, dict[str, Encoding]] = {
     types.RAW_AUDIO: {"pcm-s16": "s16"},
     types.AUDIO: {"": "f32"},
 }
-# Lost messages up to this are filled with silence, which the front-end knows for a dropout, seconds.
+# Longest loss that is filled with silence, which the front-end detects as a dropout, seconds.
 LONGEST_GAP_S = 2.0
 STATIC_TOPIC = "/tf_static"
-# Of a quaternion, as tf2 has it.
+# Tolerance of a quaternion's length, as in tf2.
 _LENGTH_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AudioPacket:
-    """The bytes of one message, which may begin and end within a sample."""
+    """The bytes of one message, which may start and end within a sample."""
 
     stamp_ns: int  # Time of the first sample
     recorded_ns: int
@@ -202,35 +202,35 @@ class AudioPacket:
 
 @dataclass(frozen=True, slots=True)
 class BagSound(sound_file.SoundStream):
-    """A topic of a bag that holds sound. Samples are its clock, from the stamp of the first one on."""
+    """A sound topic of a bag. The samples are the clock, starting at the stamp of the first sample."""
 
     path: Path
     topic: str
     sample_rate_hz: int
     channels: int
     start_ns: int
-    stated: sound_file.RawPcm | None = None  # How bytes are read, if that was stated
-    frames: int = 0  # With silence for what was lost
-    lost_ns: Mapping[int, float] = field(default_factory=dict)  # Before messages, by their number
-    again: tuple[tuple[int, int], ...] = ()  # When stamps began again, by the recorder, and what is added
+    stated: sound_file.RawPcm | None = None  # Format of the bytes, if given
+    frames: int = 0  # Including silence for losses
+    lost_ns: Mapping[int, float] = field(default_factory=dict)  # Losses by number of the message after them
+    again: tuple[tuple[int, int], ...] = ()  # Recording times at which stamps start again, and their offset
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Path of the bag, for error messages."""
         return str(self.path)
 
     def open(self) -> "BagAudio":
-        """Open it at its start."""
+        """Open the sound at its start."""
         return BagAudio(self)
 
     def time_ns(self, stamp_ns: int, recorded_ns: int) -> int:
-        """Return the time of another message on this clock; one without a stamp has that of the recorder."""
+        """Convert the stamp of another message to this clock; without a stamp, use its time of recording."""
         last = bisect_right(self.again, (recorded_ns, np.inf))
         return stamp_ns + self.again[last - 1][1] if last and stamp_ns else stamp_ns or recorded_ns
 
 
 class BagAudio(sound_file.Audio):
-    """Sound of a bag that is being read; lost messages are filled with silence."""
+    """Sound of a bag that is being read; losses are filled with silence."""
 
     def __init__(self, sound: BagSound) -> None:
         self._sound, self.path, self.frames = sound, sound.path, sound.frames
@@ -239,7 +239,7 @@ class BagAudio(sound_file.Audio):
         self.silent_channels = sound_file.constant_channels(first)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
-        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+        """Yield the recording from its start in blocks of `frames` samples; the last one may be shorter."""
         held = np.empty((0, self.channels), np.float32)
         for part in self._parts():
             held = np.concatenate([held, part])
@@ -249,10 +249,10 @@ class BagAudio(sound_file.Audio):
             yield held
 
     def close(self) -> None:
-        """Do nothing: the bag is open while its blocks are read."""
+        """Do nothing: the bag is only open while blocks are read."""
 
     def _parts(self) -> Iterator[Float32Array]:
-        """Yield the samples of each message, after silence for what was lost before it."""
+        """Yield the samples of each message, after silence for the loss before it."""
         held, done, sound = b"", 0, self._sound
         with open_bag(self.path) as bag:
             for number, packet in enumerate(audio_packets(bag, sound.topic, sound.stated)):
@@ -266,7 +266,7 @@ class BagAudio(sound_file.Audio):
                 yield samples
 
     def _tell_lost(self, lost_s: float, at_s: float) -> None:
-        """Say what is missing; refuse a long gap."""
+        """Warn of a loss; refuse a long one."""
         if lost_s > LONGEST_GAP_S:
             expected = f"expected messages on {self._sound.topic} at most {LONGEST_GAP_S:g} s apart"
             got = f"at {at_s:.3f} s the next is {lost_s:.3f} s off: cut the bag there (`ros2 bag convert`)"
@@ -275,7 +275,7 @@ class BagAudio(sound_file.Audio):
 
 
 def _lost_bytes(packet: AudioPacket, lost_ns: float, within: bool) -> int:
-    """Return the bytes that stand for what was lost: whole samples, or messages if these split samples."""
+    """Return the number of bytes of a loss: whole samples, or whole messages if these split samples."""
     whole = packet.pcm.frame_bytes
     each = len(packet.data) if within or len(packet.data) % whole else whole
     return round(lost_ns * 1e-9 * packet.pcm.sample_rate_hz * whole / each) * each
@@ -284,10 +284,10 @@ def _lost_bytes(packet: AudioPacket, lost_ns: float, within: bool) -> int:
 def audio_packets(
     bag: BagReader, topic: str, stated: sound_file.RawPcm | None = None
 ) -> Iterator[AudioPacket]:
-    """Yield what each message of a topic holds, checked against the first; refuse a topic without any."""
+    """Yield the packet of each message of a topic; refuse changes of format and a topic without messages."""
     kind, first = bag.kind_of(topic), None
     if kind == types.AUDIO and stated is not None:
-        raise InputFileError(bag.path, f"expected no --audio-format: messages of {kind} state theirs")
+        raise InputFileError(bag.path, f"expected no --audio-format: messages of {kind} contain theirs")
     if stated is None and kind in (types.STAMPED_PCM, types.PCM):
         stated = _pcm_info(bag, topic)
     for recorded_ns, message in bag.messages(topic):
@@ -300,11 +300,11 @@ def audio_packets(
         if packet.data:
             yield packet
     if first is None:
-        raise InputFileError(bag.path, f"expected samples on {topic}, it holds no message")
+        raise InputFileError(bag.path, f"expected samples on {topic}, but it has no message")
 
 
 def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
-    """Return how the bytes of audio_common are to be read, as its AudioInfo says."""
+    """Return the format of audio_common's bytes from its AudioInfo message."""
     where = bag.topic("the topic of AudioInfo", None, types.PCM_INFO)
     said = None if where is None else next(bag.messages(where), None)
     if said is None:
@@ -317,7 +317,7 @@ def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
     return _described(bag, str(where), types.PCM_INFO, info)
 
 
-# Where a message states the format, the rate and the channels of its bytes; planes of floats have one format.
+# Fields with format, rate and channels of the bytes in each message type; float planes have one format.
 _STATED = {
     types.PCM_INFO: ("sample_format", "sample_rate", "channels"),
     types.AUDIO_FRAME: ("format", "sampling_frequency", "channel_count"),
@@ -327,7 +327,7 @@ _STATED = {
 
 
 def _described(bag: BagReader, topic: str, kind: str, message: Any) -> sound_file.RawPcm:
-    """Return how bytes are to be read by a message that states it."""
+    """Return the format of bytes from a message that contains it."""
     sample_format, rate_hz, channels = (getattr(message, name, "") for name in _STATED[kind])
     if (encoding := ENCODINGS[kind].get(sample_format)) is None:
         problem = f"{topic}: expected one of {', '.join(ENCODINGS[kind])}, got {sample_format!r:.20}"
@@ -343,14 +343,15 @@ def _packet(pcm: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioPack
     else:
         stamp_ns = stamp_of(message.header) if hasattr(message, "header") else 0
     packet = AudioPacket(stamp_ns, recorded_ns, pcm, _bytes_of(pcm, message))
-    # AudioFrame is stamped when its last sample is there; what has no stamp was recorded then.
+    # The stamp of AudioFrame is the time of its last sample, and so is the recording time of messages without
+    # stamp.
     if stamp_ns and not hasattr(message, "frame_sample_count"):
         return packet
     return replace(packet, stamp_ns=max((stamp_ns or recorded_ns) - round(packet.length_ns), 0))
 
 
 def _bytes_of(pcm: sound_file.RawPcm, message: Any) -> bytes:
-    """Return samples as bytes, channels interleaved."""
+    """Return samples as bytes with interleaved channels."""
     data, layout = getattr(message, "audio", message).data, getattr(message, "layout", "interleaved")
     if hasattr(message, "layout") and len(data) % pcm.channels:
         problem = f"expected samples of {pcm.channels} channels, got {len(data)} numbers"
@@ -366,7 +367,7 @@ def _bytes_of(pcm: sound_file.RawPcm, message: Any) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class BagInput:
-    """All that a bag holds; None for what it does not."""
+    """The contents of a bag; missing parts are None."""
 
     sound: BagSound
     array: MicrophoneArray | None
@@ -377,7 +378,7 @@ class BagInput:
 def read_sound(
     path: Path, topic: str | None = None, stated: sound_file.RawPcm | None = None
 ) -> tuple[BagSound, MicrophoneArray | None]:
-    """Return the sound of a bag and its array, where it holds one."""
+    """Return the sound of a bag and its array, if it contains one."""
     with open_bag(path) as bag, refused_as_file(path):
         return sound_of_bag(bag, topic, stated), _array(bag)
 
@@ -385,18 +386,18 @@ def read_sound(
 def read_bag(
     path: Path, *, audio: str | None = None, detections: str | None = None, odometry: str | None = None
 ) -> BagInput:
-    """Read a bag but for its samples, of the topics named or else the only ones of their types.
+    """Read all of a bag except its samples, from the given topics or the only ones of their types.
 
     Raises
     ------
     InputFileError
-        If it is damaged, has no sound, several topics would do, or a message holds what cannot be.
+        If the bag is damaged, has no sound, several topics fit, or a message contains impossible values.
     """
     return read_beside(read_sound(path, audio)[0], detections=detections, odometry=odometry)
 
 
 def read_beside(sound: BagSound, *, detections: str | None = None, odometry: str | None = None) -> BagInput:
-    """Read what a bag holds beside its sound."""
+    """Read the contents of a bag other than its sound."""
     with open_bag(sound.path) as bag, refused_as_file(sound.path):
         seen = bag.topic("--topic detections=", detections, types.DETECTIONS)
         driven = bag.topic("--topic odometry=", odometry, types.ODOMETRY)
@@ -405,10 +406,10 @@ def read_beside(sound: BagSound, *, detections: str | None = None, odometry: str
 
 
 def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneArray:
-    """Return the array in `base_link`; refuse a bag that does not say where its microphones are.
+    """Return the array in `base_link`; refuse a bag without microphone positions.
 
-    A board by name is in axes of its own. Where static transforms lead from `base_link` to the frame of the
-    sound, it is turned and moved by them.
+    A named board has its own axes. If static transforms connect `base_link` with the frame of the sound, they
+    are applied to it.
     """
     if array is None:
         raise InputFileError(sound.path, f"expected --array, or a message of {types.ARRAY} in the bag")
@@ -426,7 +427,7 @@ def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneAr
 
 
 def _in_base_link(bag: BagReader, sound: BagSound, points_m: FloatArray) -> FloatArray | None:
-    """Return points of the sound's frame in `base_link`, None where no static transforms lead there."""
+    """Return points of the sound's frame in `base_link`; None if no static transforms connect the two."""
     _, first = next(bag.messages(sound.topic))
     frame = _frame_name(first.header.frame_id) if hasattr(first, "header") else ""
     transforms, passed = _static_transforms(bag), set[str]()
@@ -441,7 +442,7 @@ def _in_base_link(bag: BagReader, sound: BagSound, points_m: FloatArray) -> Floa
 
 
 def _static_transforms(bag: BagReader) -> dict[str, tuple[str, Any]]:
-    """Return the parent of every frame and the transform to it, of several the last."""
+    """Return the parent of every frame and the last transform to it."""
     found: dict[str, tuple[str, Any]] = {}
     if not bag.count(STATIC_TOPIC) or bag.kind_of(STATIC_TOPIC) != types.TRANSFORMS:
         return found
@@ -457,11 +458,11 @@ def _static_transforms(bag: BagReader) -> dict[str, tuple[str, Any]]:
 
 
 def _frame_name(text: str) -> str:
-    return text.removeprefix("/")  # which ROS 1 had
+    return text.removeprefix("/")  # used by ROS 1
 
 
 def _in_parent(path: Path, transform: Any, points_m: FloatArray) -> FloatArray:
-    """Return points of a frame in its parent's."""
+    """Convert points of a frame to its parent frame."""
     from scipy.spatial.transform import Rotation
 
     turn, by = transform.rotation, transform.translation
@@ -474,7 +475,7 @@ def _in_parent(path: Path, transform: Any, points_m: FloatArray) -> FloatArray:
 
 
 def sound_of_bag(bag: BagReader, topic: str | None, stated: sound_file.RawPcm | None = None) -> BagSound:
-    """Return the sound of a bag by the stamps of all its messages; refuse one without."""
+    """Return the sound of a bag with the stamps of all its messages; refuse a bag without sound."""
     heard = bag.topic("--topic audio=", topic, *AUDIO_KINDS)
     if heard is None:
         raise InputFileError(bag.path, f"expected a topic of {' or '.join(AUDIO_KINDS)}, got {bag.told()}")
@@ -487,7 +488,7 @@ def sound_of_bag(bag: BagReader, topic: str | None, stated: sound_file.RawPcm | 
         lengths.append(packet.length_ns)
         data += packet.data if len(data) < LOOK_BYTES else b""
     if not stamps:
-        raise InputFileError(bag.path, f"expected samples on {heard}, its messages are empty")
+        raise InputFileError(bag.path, f"expected samples on {heard}, but its messages are empty")
     pcm = packet.pcm
     pcm.check_encoding(data)
     sound = BagSound(bag.path, heard, pcm.sample_rate_hz, pcm.channels, stamps[0], stated)
@@ -497,7 +498,7 @@ def sound_of_bag(bag: BagReader, topic: str | None, stated: sound_file.RawPcm | 
 def _on_samples(
     sound: BagSound, stamps_ns: IntArray, recorded_ns: IntArray, lengths_ns: FloatArray
 ) -> BagSound:
-    """Return sound with the losses and the repetitions that its stamps show."""
+    """Return the sound with the losses and repetitions that its stamps show."""
     again = begins_again(stamps_ns, lengths_ns)
     added_ns = np.zeros(len(stamps_ns), dtype=np.int64)
     for k, more_ns in again:
@@ -538,14 +539,14 @@ def _detections(bag: BagReader, topic: str, sound: BagSound) -> DetectionLog:
 def _timed(
     bag: BagReader, topic: str, sound: BagSound, read: Callable[[Any], T], most: int = MAX_FRAMES
 ) -> tuple[list[int], list[T]]:
-    """Return increasing times on the clock of the sound, and what messages hold.
+    """Return increasing times on the clock of the sound, and the contents of the messages.
 
-    Stamps three in four of which came before, as of a node that states when it began, are none. A message
-    without a stamp was recorded shortly after what it tells.
+    If more than three in four stamps repeat an earlier one, as of a node that sends its start time, they are
+    ignored. The time of recording then replaces them, as for messages without a stamp.
     """
     told = [(stamp_of(one.header), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)]
     stamped = [stamp_ns for stamp_ns, *_ in told if stamp_ns]
-    if stands := 4 * len({*stamped}) < len(stamped):  # few transports deliver a message so often
+    if stands := 4 * len({*stamped}) < len(stamped):  # transports hardly ever repeat a message so often
         _LOG.warning("%s: stamps of %s stand still, times of recording count", bag.path, topic)
     times = [sound.time_ns(0 if stands else stamp_ns, recorded_ns) for stamp_ns, recorded_ns, _ in told]
     order = in_order(times, f"{bag.path} {topic}")
@@ -553,7 +554,7 @@ def _timed(
 
 
 def detection_frame(found: Any) -> DetectionFrame:
-    """Return the boxes of an image, checked as those of a file."""
+    """Return the boxes of an image, with the same checks as for a file."""
     best = [_best(one.results) for one in found]
     labels, scores = [label for label, _ in best], [score for _, score in best]
     boxes = [_box(one.bbox) for one in found]
@@ -561,24 +562,24 @@ def detection_frame(found: Any) -> DetectionFrame:
 
 
 def _box(box: Any) -> tuple[float, float, float, float]:
-    """Return left, top, right and bottom; the centre has a point since ROS 2 Humble, x and y before."""
+    """Return left, top, right and bottom; the centre contains a point since ROS 2 Humble, x and y before."""
     centre = getattr(box.center, "position", box.center)
     half = 0.5 * box.size_x, 0.5 * box.size_y
     return centre.x - half[0], centre.y - half[1], centre.x + half[0], centre.y + half[1]
 
 
 def _best(results: Any) -> tuple[str, float]:
-    """Return class and score of the best hypothesis; of a box without one nothing is claimed."""
+    """Return class and score of the best hypothesis, or "unknown" and 0 for a box without one."""
     said = [getattr(one, "hypothesis", one) for one in results]
     best = max(said, key=lambda one: one.score, default=None)
     if best is None:
         return "unknown", 0.0
-    # It was called id before ROS 2 Galactic.
+    # The field was called id before ROS 2 Galactic.
     return str(getattr(best, "class_id", getattr(best, "id", "unknown"))), float(best.score)
 
 
 def _ego(bag: BagReader, topic: str, sound: BagSound) -> OdometryLog:
-    # Not its pose: the frame of odometry is not the map in which the corners of a context stand.
+    # The pose is not used, because the odometry frame is not the map of the context's corners.
     def moved(message: Any) -> tuple[float, float]:
         return message.twist.twist.linear.x, message.twist.twist.angular.z
 

@@ -1,4 +1,4 @@
-"""Bags of ROS 2 written: a recording as a vehicle would have recorded it, and world-states."""
+"""Writers of ROS 2 bags: a recording as a vehicle would store it, and world-states."""
 
 import heapq
 import math
@@ -27,14 +27,14 @@ from .bag_input import STATIC_TOPIC, open_bag
 from .message_types import header, message, time_of, typestore
 
 Storage = Literal["mcap", "sqlite3"]
-# Takes topic, type, stamp in ns and the values of the message's fields.
+# Arguments: topic, type, stamp in ns and the values of the message's fields.
 WriteMessage: TypeAlias = Callable[[str, str, int, Mapping[str, Any]], None]
-# Of the bag's metadata: the last that ROS 2 Humble to Jazzy read.
+# Version of the bag's metadata: the last one that ROS 2 Humble to Jazzy can read.
 _VERSION: Literal[8] = 8
 AUDIO_TOPIC, ARRAY_TOPIC = "/microphones/audio", "/microphones/array"
 DETECTIONS_TOPIC, ODOMETRY_TOPIC = "/camera/detections", "/odometry"
 MICROPHONES_FRAME, CAMERA_FRAME = "microphones", "camera"
-# Of a second, as drivers deliver sound.
+# Typical rate of audio drivers.
 _BLOCKS_PER_SECOND = 10
 
 # Stamp from the start of the recording, topic, type, values.
@@ -42,36 +42,37 @@ _Event = tuple[int, str, str, dict[str, Any]]
 
 
 def check_bag_target(path: Path) -> Path:
-    """Return where a bag would be written; refuse a name that is taken.
+    """Return the target of a bag; refuse a name that is in use.
 
     Examples
     --------
     >>> check_bag_target(Path("/dev"))
     Traceback (most recent call last):
-    worldstate.ground.errors.InputFileError: /dev: expected a name that is free, a bag is a new folder
+    worldstate.ground.errors.InputFileError: /dev: expected a new name, because a bag is a new folder
     """
     if path.exists():
-        raise InputFileError(path, "expected a name that is free, a bag is a new folder")
+        raise InputFileError(path, "expected a new name, because a bag is a new folder")
     return check_target(path)
 
 
 @contextmanager
 def bag_writer(path: Path, storage: Storage = "mcap") -> Iterator[WriteMessage]:
-    """Lend a function that writes messages to a new bag, which takes its name when the block ends.
+    """Yield a function that writes messages to a new bag, which gets its name when the block ends.
 
     Raises
     ------
     InputFileError
-        If the name is taken or its folder is not there.
+        If the name is in use or its folder is missing.
     MissingExtraError
-        Without rosbags.
+        If rosbags is not installed.
     """
     store, target = typestore(), check_bag_target(path)
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     with atomic_path(target) as temporary:
         temporary.mkdir()
-        # A storage file is named after its folder: it is written into one of the final name, then moved up.
+        # A storage file has the name of its folder, so it is written into a folder of the final name and
+        # moved up.
         inner = temporary / target.name
         with Writer(inner, version=_VERSION, storage_plugin=StoragePlugin[storage.upper()]) as bag:
             connections: dict[str, Any] = {}
@@ -91,10 +92,10 @@ def bag_writer(path: Path, storage: Storage = "mcap") -> Iterator[WriteMessage]:
 
 
 def _kept_for_late() -> Any:
-    """Return the quality of service of static transforms: who listens later is sent them, too."""
+    """Return the quality of service of static transforms: they are also sent to late subscribers."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-    ever = QosTime(9_223_372_036, 854_775_807)  # as ROS 2 writes that there is no end
+    ever = QosTime(9_223_372_036, 854_775_807)  # infinity in ROS 2
     sent = QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL
     return Qos(*sent, ever, ever, QosLiveliness.AUTOMATIC, ever, avoid_ros_namespace_conventions=False)
 
@@ -110,9 +111,9 @@ def write_bag(
     start_ns: int = 0,
     storage: Storage = "mcap",
 ) -> Iterator[float]:
-    """Write a recording to a new bag; yield how much of the sound is written after each block, seconds.
+    """Write a recording to a new bag; yield the duration of the sound written after each block, seconds.
 
-    The stamps of detections and speeds count from the start of the recording; `start_ns` is added to all.
+    Stamps of detections and speeds are relative to the start of the recording; `start_ns` is added to all.
     """
     with open_sound(sound, array.n_microphones, strict=False) as audio, bag_writer(path, storage) as write:
         write(STATIC_TOPIC, types.TRANSFORMS, start_ns, {"transforms": _frames(array, camera, start_ns)})
@@ -128,7 +129,7 @@ def write_bag(
 
 
 def odometry_of(recording: Recording) -> OdometryLog | None:
-    """Return the odometry of a recording's ego: it stands, as simulated where that is known."""
+    """Return the odometry of a recording: zero for a standing ego, simulated if available, else None."""
     with open_audio(recording.audio_path, strict=False) as audio:
         steps = int(audio.duration_s * FRAME_RATE_HZ) + 1
     standing = recording.moving_ego is False
@@ -145,7 +146,7 @@ def _simulated_speeds(path: Path) -> list[float]:
 
 
 def _frames(array: MicrophoneArray, camera: PinholeCamera | None, stamp_ns: int) -> list[dict[str, Any]]:
-    """Return where the frames of sound and boxes stand in `base_link`; x of the camera is its axis."""
+    """Return the poses of the sound's and the camera's frame in `base_link`; x of the camera is its axis."""
     from scipy.spatial.transform import Rotation
 
     placed = {MICROPHONES_FRAME: (array.positions_m.mean(axis=0).tolist(), (0.0, 0.0, 0.0))}
@@ -208,10 +209,10 @@ def _driven(ego: OdometryLog | None, start_ns: int) -> Iterator[_Event]:
         yield stamp_ns, ODOMETRY_TOPIC, types.ODOMETRY, frames | {"twist": {"twist": twist}}
 
 
-# Autoware's planners listen for objects there.
+# Topic to which Autoware's planners subscribe.
 ADVISORIES_TOPIC, OBJECTS_TOPIC = "/worldstate/advisories", "/perception/object_recognition/objects"
 MARKERS_TOPIC, SNAPSHOT_TOPIC = "/worldstate/markers", "/worldstate/snapshot"
-# Of visualization_msgs/Marker.
+# Constants of visualization_msgs/Marker.
 ARROW, CUBE, LINE_STRIP, LABEL, TRIANGLE_LIST = 0, 1, 4, 9, 11
 ADD, DELETE_ALL = 0, 3
 
@@ -220,7 +221,7 @@ ADD, DELETE_ALL = 0, 3
 def state_bag(
     path: Path, crossing_m: float = CROSSING_M, storage: Storage = "mcap"
 ) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes states to a new bag."""
+    """Yield a function that writes states to a new bag."""
     with bag_writer(path, storage) as write:
 
         def write_state(state: WorldState) -> None:
@@ -234,7 +235,7 @@ def state_bag(
 
 
 def bag_snapshot_lines(path: Path) -> Iterator[str]:
-    """Yield the snapshots of a bag as the text that was written."""
+    """Yield the snapshots of a bag as the JSON text that was written."""
     with open_bag(path) as bag:
         if bag.count(SNAPSHOT_TOPIC) and bag.kind_of(SNAPSHOT_TOPIC) == types.TEXT:
             yield from (message.data for _, message in bag.messages(SNAPSHOT_TOPIC))
@@ -284,7 +285,7 @@ def _advisory(cue: RiskCue) -> dict[str, Any]:
 
 
 def scene_markers(state: WorldState) -> dict[str, Any]:
-    """Return the values of a MarkerArray: what was drawn before goes, what the snapshot says comes.
+    """Return the values of a MarkerArray that deletes earlier markers and draws the snapshot.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Message types of ROS 2: those that rosbags knows, and the definitions that ship here."""
+"""Message types of ROS 2: those of rosbags, and the definitions that ship with this package."""
 
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -21,19 +21,19 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _OURS = ("MultiChannelAudio", "MicrophoneArray", "RiskAdvisory", "RiskAdvisories")
 _OTHERS = "audio_common_msgs", "audio_utils_msgs", "autoware_perception_msgs", "foxglove_msgs", "vision_msgs"
-# What stands between the definitions of a file that holds several, as in bags.
+# Separator of the definitions in one file, as in bags.
 _SEPARATOR = "=" * 80 + "\nMSG: "
 _SPECIAL = {"string": "", "wstring": "", "bool": False}
 
 
 @cache
 def typestore() -> Any:
-    """Return rosbags' store of the types of ROS 2 Humble, with those that it lacks.
+    """Return rosbags' store of the types of ROS 2 Humble, with further types added.
 
     Raises
     ------
     MissingExtraError
-        Without rosbags.
+        If rosbags is not installed.
     """
     typesys = optional("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -43,19 +43,19 @@ def typestore() -> Any:
 
 
 def message(name: str, values: Mapping[str, Any]) -> Any:
-    """Return a message of a type; fields that are not given are zero or empty."""
+    """Return a message of a type; missing fields are zero or empty."""
     store = typestore()
     fields = {
         field: _value(kind, values.get(field))
         for field, kind in store.fielddefs[name][1]
-        # The type has it, ROS has it not: of an empty message.
+        # Only rosbags has this field, in empty messages; ROS does not.
         if field != "structure_needs_at_least_one_member"
     }
     return store.types[name](**fields)
 
 
 def header(stamp_ns: int, frame_id: str = "base_link") -> dict[str, Any]:
-    """Return the values of a header.
+    """Return the values of a message header.
 
     Examples
     --------
@@ -66,18 +66,18 @@ def header(stamp_ns: int, frame_id: str = "base_link") -> dict[str, Any]:
 
 
 def time_of(stamp_ns: int) -> dict[str, int]:
-    """Return the values of a time or a duration."""
+    """Return the values of a ROS time or duration."""
     sec, nanosec = divmod(stamp_ns, 1_000_000_000)
     return {"sec": sec, "nanosec": nanosec}
 
 
 def stamp_of(header: Any) -> int:
-    """Return the stamp of a header, ns."""
+    """Return the stamp of a message header, ns."""
     return instant_of(header.stamp)
 
 
 def instant_of(time: Any) -> int:
-    """Return a time, ns."""
+    """Return a ROS time in ns."""
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)
 
 
@@ -92,7 +92,7 @@ def _definitions() -> Iterator[tuple[str, str]]:
 
 
 def _value(kind: tuple[Any, Any], value: Any) -> Any:
-    """Return a value in the form that its field wants: message, number, text, or a list of these."""
+    """Convert a value to the form of its field: message, number, text, or a list of these."""
     node, about = kind
     if node.name == "NAME":
         return message(about, value or {})

@@ -1,35 +1,38 @@
-"""Samples are the clock of sound that comes in messages: their stamps only show what was lost."""
+"""Clock of sound in messages: the samples give the time, and the stamps only reveal losses."""
 
 import numpy as np
 
 from worldstate.ground.typing import FloatArray, IntArray
 
-# A delay that later messages make up for within so long is jitter, a burst or a stall of the recorder.
+# A delay that later messages recover within this time is jitter, a burst or a stall of the recorder.
 CATCH_UP_NS = 30_000_000_000
-# Of the last messages nothing follows that could catch up: what is lost there is not known.
+# After the last messages nothing follows that could recover a delay, so losses there are unknown.
 _LEAST_AFTER_NS = 500_000_000
-# Messages whose delays the next ones are compared with: enough to leave out single early stamps.
+# Number of messages with which a delay is compared, its minimum, and the share of early stamps that is
+# ignored.
 _BEFORE, _LEAST_BEFORE, _EARLY = 200, 3, 0.1
-# So many later messages show the least delay well; of fewer all have to be later than any before.
+# This many later messages show the least delay reliably; with fewer, all must be later than any message
+# before.
 _FEW_AFTER = 50
-# Stamps that go back by more, and stay, begin again: a bag that was played in a loop.
+# If stamps go back by more than this for so many messages, they start again, as of a bag played in a loop.
 _AGAIN_NS, _AGAIN = 2_000_000_000, 5
-# Stamps that span less of the samples are no clock, such as those that are all the same.
+# Stamps that span a smaller share of the samples, such as equal stamps, are no clock.
 _LEAST_SPAN = 0.05
-# Of another rate every piece of a recording is so much longer than its stamps span, of a stall some are.
+# With a wrong rate, every piece of a recording is longer than the span of its stamps; with a stall, only some
+# pieces are.
 _PIECES, _LONG_SHARE = 8, 0.75
 
 
 def lost_before(stamps_ns: IntArray, lengths_ns: FloatArray) -> tuple[FloatArray, float]:
-    """Return how much was lost before each message, and by how much the first stamp is too late, ns.
+    """Return the loss before each message, and by how much the first stamp is too late, ns.
 
-    The delay of message k is d_k = s_k - sum of the lengths before it. Before k a loss is
+    The delay of message k is d_k = s_k - sum of the lengths before it. The loss before k is
 
         min_{j >= k} d_j - usual(d_i, i < k)
 
     if the minimum is more than half a message above the median of the d_i. The minimum is over the next 30 s,
-    and *usual* is the delay that one in ten of the last messages is below. A delay that is made up for does
-    not count, nor does a stamp that is not above the one before it.
+    and *usual* is the 10 % quantile of the delays of the last messages. A delay that is recovered is ignored,
+    and so is a stamp that is not above the previous one.
 
     Parameters
     ----------
@@ -39,9 +42,9 @@ def lost_before(stamps_ns: IntArray, lengths_ns: FloatArray) -> tuple[FloatArray
     Returns
     -------
     ndarray
-        Shape (n,), 0 where nothing is missing.
+        Shape (n,), 0 if nothing is missing.
     float
-        0 if it is less than half a message.
+        0 if below half a message.
 
     Examples
     --------
@@ -61,7 +64,7 @@ def lost_before(stamps_ns: IntArray, lengths_ns: FloatArray) -> tuple[FloatArray
     coming = minimum_filter1d(delays, window, mode="constant", cval=np.inf, origin=-(window // 2))
     lost, total, last_ns = np.zeros(len(begins)), 0.0, begins[-1] + lengths_ns[-1] - _LEAST_AFTER_NS
     for k in range(_LEAST_BEFORE, int(np.searchsorted(begins, last_ns, "right"))):
-        before = np.sort(delays[max(k - _BEFORE, 0) : k])  # without what was lost before them
+        before = np.sort(delays[max(k - _BEFORE, 0) : k])  # corrected for earlier losses
         before = before[: np.searchsorted(before, np.inf)]
         if len(before) >= _LEAST_BEFORE:
             usual = before[max(1, int(_EARLY * len(before)))]
@@ -76,7 +79,7 @@ def lost_before(stamps_ns: IntArray, lengths_ns: FloatArray) -> tuple[FloatArray
 
 
 def begins_again(stamps_ns: IntArray, lengths_ns: FloatArray) -> list[tuple[int, int]]:
-    """Return the messages from which on stamps begin again, each with what has to be added to them, ns.
+    """Return the messages at which stamps start again, with the offset to add from there on, ns.
 
     Examples
     --------
@@ -94,11 +97,11 @@ def begins_again(stamps_ns: IntArray, lengths_ns: FloatArray) -> list[tuple[int,
 
 
 def contradiction(stamps_ns: IntArray, lengths_ns: FloatArray, lost_ns: FloatArray) -> str:
-    """Return how stamps and samples contradict each other as a whole, empty where they do not."""
+    """Return how stamps and samples contradict each other as a whole; empty if they agree."""
     ends = np.linspace(0, len(stamps_ns) - 1, _PIECES + 1).astype(int)
     spans, sent = np.diff(stamps_ns[ends]), np.diff((np.cumsum(lengths_ns) - lengths_ns)[ends])
     longer = sent.sum() - spans.sum() > _AGAIN_NS and bool((spans < _LONG_SHARE * sent).all())
-    # Losses before most messages are no losses but another rate.
+    # Losses before most messages mean that the rate is wrong.
     if (lost_ns > 0.0).mean() > 0.5 or (longer and bool((spans > _LEAST_SPAN * sent).all())):
         said = "stamps advance by {:.1f} s while {:.1f} s of samples were sent"
         return said.format(1e-9 * (spans.sum() + lengths_ns[-1]), 1e-9 * lengths_ns.sum())

@@ -592,7 +592,7 @@ def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
         (
             "four",
             ["--array", str(array), "--export", f"rosbag={tmp_path / 'two'}"],
-            "expected a name that is free",
+            "expected a new name",
         ),
     ):
         options = [*options, *(["--uncalibrated"] if "--array" in options else [])]
