@@ -1,4 +1,4 @@
-"""Plain samples: how their bytes are decoded, and where RIFF, RF64, BW64 and W64 files keep them."""
+"""Plain samples: decoding of their bytes, and their location in RIFF, RF64, BW64 and W64 files."""
 
 import io
 import os
@@ -15,38 +15,38 @@ from numpy.typing import NDArray
 from worldstate.ground.typing import Float32Array, FloatArray
 
 Encoding = Literal["s16", "s24", "s24_32", "s32", "f32"]
-# Of libsndfile, but for the one that it lacks: 24 bits in the lower three of four bytes (ALSA's S24_LE).
+# Names of libsndfile, except for a missing one: 24 bits in the lower three of four bytes (ALSA's S24_LE).
 PADDED_24 = "PCM_24_32"
 _NAMES = "PCM_16", "PCM_24", PADDED_24, "PCM_32", "FLOAT"
 SUBTYPES: dict[Encoding, str] = dict(zip(get_args(Encoding), _NAMES, strict=True))
 MAX_CHUNKS, MAX_CHANNELS, MAX_RATE_HZ = 10_000, 1024, 10_000_000
 _W64_RIFF = bytes.fromhex("726966662e91cf11a5d628db04c10000")
 _UNKNOWN_SIZE = 0xFFFFFFFF
-# Recorders that do not know the length yet write a size near a multiple of 2 GiB: arecord 0x80000000 or
+# While the length is unknown, recorders write a size near a multiple of 2 GiB: arecord 0x80000000 or
 # 0x7FFFFF00, SoX 0x7FFFF000, ffmpeg 0xFFFFFFFF, some rounded to whole samples of all channels.
 _OPEN_SIZE, _NEAR_BYTES = 1 << 31, 1 << 16
-# Enough samples to see how they are stored.
+# Enough samples to determine their format.
 LOOK_BYTES = 1 << 16
-# By the format's tag (1 whole numbers, 3 floats), then the bytes of a sample.
+# By format tag (1 integers, 3 floats), then by bytes per sample.
 _WHOLE, _FLOATS = {1: "PCM_U8", 2: "PCM_16", 3: "PCM_24", 4: "PCM_32"}, {4: "FLOAT", 8: "DOUBLE"}
 
 
 def decoded(data: bytes, subtype: str, channels: int) -> Float32Array:
     """Return little-endian samples of full scale 1, shape (n, channels)."""
     if subtype == PADDED_24:
-        whole = np.frombuffer(data, "<i4") << 8  # whatever the fourth byte holds: sign, zero or rubbish
+        whole = np.frombuffer(data, "<i4") << 8  # drops the fourth byte: sign, zero or garbage
         return (whole.astype(np.float32) * np.float32(2.0**-31)).reshape(-1, channels)
-    # Rate 1: nothing of it is read.
+    # The rate 1 is not used.
     raw = {"format": "RAW", "subtype": subtype, "endian": "LITTLE", "samplerate": 1, "channels": channels}
     return np.asarray(soundfile.read(io.BytesIO(data), dtype="float32", always_2d=True, **raw)[0])
 
 
 def four_byte_form(data: bytes) -> Encoding | None:
-    """Return what samples of four bytes each obviously are; None for all others, and for silence.
+    """Return the obvious format of samples of four bytes each; None for all others, and for silence.
 
-    The fourth byte decides: floats within full scale have exponents of one kind, 24 bits are followed by
-    their sign or zero, and converters of 24 bits leave the first byte of 32 empty. Bytes of two or three a
-    sample do not line up so, but for silence.
+    The fourth byte determines it: floats within full scale have similar exponents, 24 bits are followed by
+    their sign or by zero, and 24-bit converters leave the first of four bytes empty. Samples of two or three
+    bytes do not match these patterns, except for silence.
 
     Examples
     --------
@@ -63,21 +63,21 @@ def four_byte_form(data: bytes) -> Encoding | None:
         return None
     if ((top & 0x70) == 0x30).all():
         return "f32"
-    if (top == 0).all() or (top == raw << 8 >> 31).all():  # the first byte is empty in that of 16 bits, too
+    if (top == 0).all() or (top == raw << 8 >> 31).all():  # also true of 16 bits with an empty first byte
         return "s24_32"
     return None if (raw & 0xFF).any() else "s32"
 
 
-# Neighbouring samples of sound correlate by more than the first number in every channel; decoded wrongly,
-# those of one correlate by less than the second, at more than the third of full scale.
+# In sound, neighbouring samples of every channel have a correlation above the first number. If the format is
+# wrong, one channel has a correlation below the second at a level above the third (of full scale).
 _SMOOTH, _ROUGH, _LOUD = 0.7, 0.35, 0.3
 _FORMS = {"s16": "<i2", "s24": "", "s32 or s24_32": "<i4", "s16, big-endian": ">i2", "s32, big-endian": ">i4"}
 
 
 def smooth_form(data: bytes, stated: Encoding, channels: int) -> str | None:
-    """Return in which form samples are smooth that are loud noise in the stated one; None for none.
+    """Return the format in which samples are smooth that are loud noise in the stated one; None if none.
 
-    Pairs of 16 bits are smooth as numbers of 32 bits, too; the lower halves of such numbers are not.
+    Pairs of 16-bit samples are also smooth as 32-bit numbers; the lower halves of such numbers are not.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def smooth_form(data: bytes, stated: Encoding, channels: int) -> str | None:
 
 
 def _likeness(samples: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-    """Return how neighbouring samples of each channel that is not constant correlate, and its deviation."""
+    """Return correlation of neighbouring samples and standard deviation of each non-constant channel."""
     about = samples.astype(np.float64) - samples.mean(axis=0)
     power = (about**2).sum(axis=0)
     live, along = power > 0.0, (about[1:] * about[:-1]).sum(axis=0)
@@ -111,28 +111,28 @@ def _likeness(samples: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 
 class _Form(NamedTuple):
-    """How a kind of file lays its chunks out."""
+    """Layout of the chunks of a file format."""
 
-    first: int  # Byte at which the first chunk begins
+    first: int  # Position of the first chunk in bytes
     header: struct.Struct  # Name and size
-    counted: int  # Bytes of the header that the size counts
-    padded: int  # Chunks begin at multiples of it
+    counted: int  # Bytes of the header that are included in the size
+    padded: int  # Chunks start at multiples of this
 
 
 _RIFF, _W64 = _Form(12, struct.Struct("<4sI"), 0, 2), _Form(40, struct.Struct("<4s12xQ"), 24, 8)
 
 
 class PlainSamples:
-    """The samples of a file by its chunks, in what an `AudioSource` uses of `soundfile.SoundFile`.
+    """The samples in the chunks of a file, with the interface of `soundfile.SoundFile` for `AudioSource`.
 
     Attributes
     ----------
     declared_bytes, n_bytes, there_bytes : int
-        Of samples: as the header counts them, as the chunks show, and from the first one to the file's end.
+        Bytes of samples by the header, by the chunks, and from the first sample to the end of the file.
     look : bytes
-        The first samples.
+        Bytes of the first samples.
     needed : bool
-        Whether libsndfile would read them wrongly (24 bits in four bytes as three) or not at all (BW64).
+        Whether libsndfile reads the samples wrongly (24 bits in four bytes as three) or not at all (BW64).
     """
 
     def __init__(self, file: BinaryIO, form: _Form, first: int, declared: int, about: bytes) -> None:
@@ -146,7 +146,7 @@ class PlainSamples:
         self.subtype = {1: _WHOLE, 3: _FLOATS}.get(tag, {}).get(each)
         self.seek(0)
         self.look = file.read(LOOK_BYTES)
-        # Arecord writes 24 bits into the lower bytes of four, all others into the upper.
+        # Arecord stores 24 bits in the lower three of four bytes, all other programs in the upper three.
         if (tag, each, bits) == (1, 4, 24) and four_byte_form(self.look) == "s24_32":
             self.subtype = PADDED_24
         file.seek(0)
@@ -156,7 +156,7 @@ class PlainSamples:
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed."""
+        """Whether the file is closed."""
         return self._file.closed
 
     def seek(self, frame: int) -> None:
@@ -164,12 +164,12 @@ class PlainSamples:
         self._file.seek(self._first + frame * self._frame_bytes)
 
     def read(self, frames: int, **_: object) -> Float32Array:
-        """Return so many samples of all channels."""
+        """Return the next `frames` samples of all channels."""
         return decoded(self._file.read(frames * self._frame_bytes), str(self.subtype), self.channels)
 
 
 def plain_samples(path: Path) -> PlainSamples | None:
-    """Open a RIFF, RF64, BW64 or W64 file by its chunks; None for all others."""
+    """Open a RIFF, RF64, BW64 or W64 file by its chunks; return None for other files."""
     with ExitStack() as opened:
         file = opened.enter_context(path.open("rb"))
         magic, about, wide = file.read(16), b"", _UNKNOWN_SIZE
@@ -188,7 +188,7 @@ def plain_samples(path: Path) -> PlainSamples | None:
 
 
 def _chunks(file: BinaryIO, form: _Form, at: int | None = None) -> Iterator[tuple[bytes, int, int]]:
-    """Yield name, size and first byte of each chunk, the file at that byte; the last may be cut."""
+    """Yield name, size and first byte of each chunk, the file at that byte; the last may be truncated."""
     at, end = form.first if at is None else at, os.fstat(file.fileno()).st_size
     for _ in range(MAX_CHUNKS):
         file.seek(min(at, end))
@@ -201,17 +201,17 @@ def _chunks(file: BinaryIO, form: _Form, at: int | None = None) -> Iterator[tupl
 
 
 def _held_bytes(file: BinaryIO, form: _Form, at: int, declared: int, there: int) -> int:
-    """Return how many bytes of samples a file holds: as declared where nothing contradicts it."""
+    """Return the number of bytes of samples: the declared one unless the file contradicts it."""
     if declared > there:
         far = min(declared % _OPEN_SIZE, -declared % _OPEN_SIZE)
         return there if far <= _NEAR_BYTES < declared else declared
-    # A size has wrapped round if chunks follow some multiple of 4 GiB behind it.
+    # The size has overflowed if chunks follow at a multiple of 4 GiB after it.
     ends = range(declared, there + 1, 1 << 32)
     return next((end for end in ends if _only_chunks(file, form, at + end, at + there)), there)
 
 
 def _only_chunks(file: BinaryIO, form: _Form, begin: int, end: int) -> bool:
-    """Whether nothing but whole chunks follows; some writers do not pad what is before them."""
+    """Return whether only whole chunks follow; some writers do not pad the chunk before them."""
     for start in {begin, begin + -begin % form.padded}:
         last = start
         for name, size, at in _chunks(file, form, start):

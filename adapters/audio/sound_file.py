@@ -1,4 +1,4 @@
-"""Recordings, read in blocks and checked when they are opened: one file, a file a microphone, a pipe."""
+"""Recordings, read in blocks and checked when opened: one file, one file per microphone, or a pipe."""
 
 import logging
 import os
@@ -37,17 +37,17 @@ _WAYS_ON = {
     ".bag": "; a bag of ROS 1: `rosbags-convert --src IN.bag --dst OUT` makes one of ROS 2",
     ".raw": "; samples without a header are read from standard input: pcm:RATE:CHANNELS:FORMAT",
 }
-# Lossy codecs keep what the ear needs and lose the phase between microphones.
+# Lossy codecs are refused, because they lose the phase between microphones.
 FLOATING = ("FLOAT", "DOUBLE")
 ENCODINGS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", *FLOATING)
 SHORTEST_S = 1.0
-# Floats may exceed full scale a little; whole numbers written as floats do by thousands.
+# Floats may slightly exceed full scale; integers stored as floats exceed it by thousands.
 _OVER_FULL_SCALE = 16.0
 _MAGIC = b"RIFF", b"RF64", b"riff", b"fLaC", b"FORM"
 
 
 class Audio(ABC):
-    """A recording that is being read; a context manager, so that its files are closed on the way out."""
+    """An open recording. It is a context manager that closes its files."""
 
     path: Path
     sample_rate_hz: int
@@ -57,16 +57,16 @@ class Audio(ABC):
 
     @property
     def duration_s(self) -> float:
-        """Length in seconds; of a pipe, what has been read."""
+        """Length in seconds; for a pipe, the length read so far."""
         return self.frames / self.sample_rate_hz
 
     @abstractmethod
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
-        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+        """Yield the recording from its start in blocks of `frames` samples; the last one may be shorter."""
 
     @abstractmethod
     def close(self) -> None:
-        """Close what was opened for it."""
+        """Close the recording's files."""
 
     def __enter__(self) -> Self:
         return self
@@ -78,17 +78,17 @@ class Audio(ABC):
         """Refuse another number of channels than microphones."""
         if expect_channels is not None and self.channels != expect_channels:
             expected = f"expected {expect_channels} channels, one per microphone"
-            way_out = "; --channels names those of the microphones" if self.channels > expect_channels else ""
+            way_out = "; --channels selects the microphones" if self.channels > expect_channels else ""
             raise InputFileError(self.path, f"{expected}, got {self.channels}{way_out}")
 
     def check_size(self, expect_channels: int | None) -> None:
-        """Refuse another number of channels than microphones, and less than a second."""
+        """Refuse another number of channels than microphones, or less than one second."""
         self.check_channels(expect_channels)
         if self.duration_s < SHORTEST_S:
             raise InputFileError(self.path, f"expected at least 1 s of audio, got {self.duration_s:.3f} s")
 
     def check_silence(self, strict: bool) -> None:
-        """Refuse silent channels; where not strict, a recording in which more are silent than not."""
+        """Refuse silent channels; if not strict, only if at least half of the channels are silent."""
         if self.silent_channels and strict:
             raise SilentChannelsError(self.path, self.silent_channels, "every channel")
         if 2 * len(self.silent_channels) > self.channels:
@@ -97,22 +97,22 @@ class Audio(ABC):
 
 
 class AudioSource(Audio):
-    """An open recording; use `open_audio` to get one.
+    """An open recording, created by `open_audio`.
 
-    A context manager, so that the file is closed on the way out.
+    It is a context manager that closes its file.
 
     Attributes
     ----------
     path : Path
         The file.
     sample_rate_hz : int
-        As the header says; OVAD's is 47,998, not 48,000.
+        Rate in the header; OVAD's is 47,998, not 48,000.
     channels : int
         Number of microphones M.
     frames : int
         Samples per channel.
     silent_channels : tuple of int
-        Channels, from 1, that hold one constant value through the first second.
+        Channels, counted from 1, with a constant value during the first second.
 
     Examples
     --------
@@ -135,24 +135,24 @@ class AudioSource(Audio):
         self.silent_channels: tuple[int, ...] = ()
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
-        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter.
+        """Yield the recording from its start in blocks of `frames` samples; the last one may be shorter.
 
         Parameters
         ----------
         frames : int
-            Samples per channel in a block, >= 1.
+            Samples per channel and block, >= 1.
 
         Yields
         ------
         ndarray
-            Shape (n, M), float32, full scale 1; a new array each time, the reader's to keep.
+            Shape (n, M), float32, full scale 1; each block is a new array.
 
         Raises
         ------
         InvalidArgumentError
-            If `frames` is below one or the recording is closed.
+            If `frames` is below 1 or the recording is closed.
         InputFileError
-            If a sample is NaN or infinite, or the data ends before the promised length.
+            If a sample is NaN or infinite, or the data ends before the length in the header.
         """
         if frames < 1:
             raise InvalidArgumentError(f"frames: expected at least 1, got {frames}")
@@ -165,13 +165,13 @@ class AudioSource(Audio):
         self._file.close()
 
     def span(self, start: int, frames: int) -> Float32Array:
-        """Return so many samples from one on, shape (frames, M)."""
+        """Return `frames` samples from sample `start`, shape (frames, M)."""
         self._seek(start)
         return self._read(start, frames)
 
     def _seek(self, frame: int) -> None:
         if self._file.closed:
-            raise InvalidArgumentError(f"{self.path}: expected an open recording, it is closed")
+            raise InvalidArgumentError(f"{self.path}: expected an open recording, but it is closed")
         try:
             self._file.seek(frame)
         except soundfile.SoundFileError as error:
@@ -190,7 +190,7 @@ class AudioSource(Audio):
 
 
 class SilentChannelsError(InputFileError):
-    """Channels of a recording hold one constant value through its first second."""
+    """Some channels of a recording have a constant value during the first second."""
 
     def __init__(self, path: Path, channels: tuple[int, ...], expected: str) -> None:
         numbers = ", ".join(map(str, channels))
@@ -202,35 +202,35 @@ class SilentChannelsError(InputFileError):
 def open_audio(
     path: str | Path, expect_channels: int | None = None, *, strict: bool = True, short: bool = False
 ) -> AudioSource:
-    """Open a WAV, RF64, W64 or FLAC recording and check what can be checked before the first block.
+    """Open a WAV, RF64, W64 or FLAC recording and check it before the first block.
 
-    FLAC holds 8 channels at most and WAV 4 GiB, nine minutes of 56 channels: use RF64 or W64 beyond.
+    FLAC is limited to 8 channels and WAV to 4 GiB (nine minutes of 56 channels); use RF64 or W64 beyond that.
 
     Parameters
     ----------
     path : str or Path
         The file.
     expect_channels : int, optional
-        Number of microphones of the array that it shall fit.
+        Required number of channels: the microphones of the array.
     strict : bool
-        True: a silent channel is an error. False: so is only a recording with more silent channels than
-        others; `AudioSource.silent_channels` lists them, and the front-end leaves them out.
+        True: a silent channel is an error. False: it is an error only if at least half of the channels are
+        silent. `AudioSource.silent_channels` lists them, and the front-end excludes them.
     short : bool
-        Whether it may be shorter than one second.
+        Whether the recording may be shorter than 1 s.
 
     Returns
     -------
     AudioSource
-        Open, at its start.
+        The open recording, at its start.
 
     Raises
     ------
     InputFileError
-        Names the file, for: missing, not audio, lossy, empty, shorter than one second, cut short (the header
-        promises more than the file holds), another number of channels, a sample in the first second that is
-        NaN or infinite.
+        If the file is missing, not audio, lossy, empty, shorter than 1 s, truncated (shorter than its header
+        states), has another number of channels, or has a sample in the first second that is NaN or infinite;
+        the message contains the file's name.
     SilentChannelsError
-        Channels constant over the first second (numbered from 1 as in the file).
+        If channels are constant during the first second; they are numbered from 1.
 
     Examples
     --------
@@ -246,16 +246,16 @@ def open_audio(
         source = _opened(Path(path), opened)
         (source.check_channels if short else source.check_size)(expect_channels)
         source.check_silence(strict)
-        opened.pop_all()  # what is fit to be read stays open
+        opened.pop_all()  # a valid recording stays open
     return source
 
 
 def _opened(path: Path, opened: ExitStack) -> AudioSource:
-    """Open a file on the stack that closes it, whatever is silent in it."""
+    """Open a file on the stack, also with silent channels."""
     source = opened.enter_context(AudioSource(path, _open_file(path)))
     if source.frames == 0:
-        raise InputFileError(path, "expected samples, the recording is empty")
-    source.span(source.frames - 1, 1)  # which a FLAC file that was cut short cannot give
+        raise InputFileError(path, "expected samples, but the recording is empty")
+    source.span(source.frames - 1, 1)  # fails for a truncated FLAC file
     source.silent_channels = constant_channels(source.span(0, min(source.sample_rate_hz, source.frames)))
     return source
 
@@ -267,7 +267,7 @@ def _open_file(path: Path) -> Any:
     try:
         if (plain := _open_plain(path)) is not None:
             return plain
-        # It encodes names itself, and refuses those that are no UTF-8.
+        # soundfile encodes names itself, and fails for names that are not UTF-8.
         file = soundfile.SoundFile(os.fsencode(path) if os.name == "posix" else path)
     except (soundfile.SoundFileError, OSError, TypeError) as error:
         way = _WAYS_ON.get(path.suffix.lower(), f"; `sox {path.name} out.wav` converts other forms")
@@ -276,12 +276,12 @@ def _open_file(path: Path) -> Any:
         kind = f"{file.format} {file.subtype}"
         file.close()
         problem = f"expected {_EXPECTED} with plain samples, got {kind}"
-        raise InputFileError(path, f"{problem}; `sox {path.name} out.wav` converts what is lossless")
+        raise InputFileError(path, f"{problem}; `sox {path.name} out.wav` converts lossless files")
     return file
 
 
 def _open_plain(path: Path) -> PlainSamples | None:
-    """Open a file whose header does not fit what follows it, and say so; refuse one that was cut short."""
+    """Open a file whose header does not match its data, with a warning; refuse a truncated file."""
     if (plain := plain_samples(path)) is None:
         return None
     numbers = plain.declared_bytes, plain.n_bytes
@@ -294,7 +294,7 @@ def _open_plain(path: Path) -> PlainSamples | None:
         plain.close()
     if plain.n_bytes > plain.there_bytes:
         problem = f"cut short: expected {numbers[0]} bytes of samples by its header, got {plain.there_bytes}"
-        raise InputFileError(path, f"{problem}; `sox --ignore-length IN OUT` keeps what is there")
+        raise InputFileError(path, f"{problem}; `sox --ignore-length IN OUT` keeps the existing samples")
     if plain.needed and numbers[0] != numbers[1]:
         told = "%s: its header promises %d bytes of samples, the file holds %d: read to their end"
         _LOG.warning(told, path, *numbers)
@@ -302,16 +302,16 @@ def _open_plain(path: Path) -> PlainSamples | None:
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:
-    """Return the channels, from 1, that hold one constant value."""
+    """Return the channels, counted from 1, with a constant value."""
     return tuple(int(channel) + 1 for channel in np.flatnonzero((first == first[:1]).all(axis=0)))
 
 
 def _cut_short(path: Path, frames: int) -> InputFileError:
-    return InputFileError(path, f"cut short or damaged: expected {frames} samples a channel by its header")
+    return InputFileError(path, f"cut short or damaged: expected {frames} samples per channel by its header")
 
 
 def check_finite(path: Path, block: Float32Array, start: int) -> None:
-    """Refuse NaN and infinity; `start` is the number of the block's first sample."""
+    """Refuse NaN and infinity, and warn of overflow; `start` is the number of the block's first sample."""
     if start == 0 and (most := float(np.abs(block).max(initial=0.0))) > _OVER_FULL_SCALE:
         _LOG.warning("%s: samples reach %.3g, beyond the full scale of 1: divide them by theirs", path, most)
     finite = np.isfinite(block)
@@ -322,44 +322,44 @@ def check_finite(path: Path, block: Float32Array, start: int) -> None:
 
 
 class SoundStream(ABC):
-    """Sound that is no file of its own: `open` gives its samples from the start on."""
+    """Sound without a file of its own, such as a pipe or a topic of a bag."""
 
     __slots__ = ()
 
-    start_ns: int = 0  # Time of the first sample on the clock of the recorder; 0 where nothing tells
+    start_ns: int = 0  # Time of the first sample on the recorder's clock; 0 if unknown
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """For messages."""
+        """Name for error messages."""
 
     @abstractmethod
     def open(self) -> Audio:
-        """Open it at its start, nothing checked."""
+        """Open the stream at its start without checks."""
 
 
 @dataclass(frozen=True, slots=True)
 class RawPcm(SoundStream):
-    """Samples without a header, little-endian, one sample of every channel after the other.
+    """Little-endian samples without a header, channels interleaved.
 
     Parameters
     ----------
     stream : binary file
-        Such as ``sys.stdin.buffer``; read once, from where it stands.
+        For example ``sys.stdin.buffer``; it is read once from its current position.
     sample_rate_hz : int
         Samples per second and channel.
     channels : int
         Number of microphones.
     encoding : {"s16", "s24", "s24_32", "s32", "f32"}
-        Whole numbers of so many bits, or floats of full scale 1; "s24_32" are 24 bits in the lower three of
-        four bytes (ALSA's S24_LE).
+        Integers of this many bits, or floats of full scale 1; "s24_32" has 24 bits in the lower three of four
+        bytes (ALSA's S24_LE).
     name : str
-        For messages.
+        Name for error messages.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range or the encoding another one.
+        If a number is out of range or the encoding is unknown.
 
     Examples
     --------
@@ -380,12 +380,12 @@ class RawPcm(SoundStream):
         one_of("encoding", self.encoding, SUBTYPES)
 
     def open(self) -> "PcmAudio":
-        """Read its first second."""
+        """Open the stream and read its first second."""
         return PcmAudio(self)
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of one sample of all channels."""
+        """Number of bytes of one sample of all channels."""
         return int(self.encoding.rpartition("_")[2].lstrip("sf")) // 8 * self.channels
 
     def to_samples(self, data: bytes) -> Float32Array:
@@ -393,30 +393,30 @@ class RawPcm(SoundStream):
         return decoded(data, SUBTYPES[self.encoding], self.channels)
 
     def check_encoding(self, data: bytes) -> None:
-        """Refuse samples that obviously have another encoding; where that is not certain, say so."""
+        """Refuse samples that obviously have another encoding; warn if that is uncertain."""
         check_encoding(self.name, data, self.encoding, self.channels)
 
 
 def check_encoding(name: str, data: bytes, stated: Encoding, channels: int) -> None:
-    """Refuse samples that obviously have another encoding; where that is not certain, say so."""
+    """Refuse samples that obviously have another encoding; warn if that is uncertain."""
     by_bytes: str | None = four_byte_form(data)
     padded = (stated, by_bytes) == ("s32", "s24_32")
-    # A channel of 16 bits that is dead or hardly used looks like whole numbers of four bytes.
+    # A dead or hardly used 16-bit channel looks like four-byte integers.
     unsure = by_bytes is None or padded or (stated == "s16" and by_bytes != "f32")
     form = smooth_form(data, stated, channels) if unsure else by_bytes
     if form not in (None, stated):
-        raise InputFileError(name, f"expected samples of {stated}, got such as those of {form}")
+        raise InputFileError(name, f"expected samples of {stated}, got samples like those of {form}")
     if padded:
         told = "%s: samples of s32 fill 24 of 32 bits; if they are 24 bits in four bytes, name s24_32"
         _LOG.warning(told, name)
 
 
-# An open recording is one whose samples come from elsewhere, such as microphones that run.
+# `Audio` is an open recording, such as of live microphones.
 SoundInput: TypeAlias = Path | tuple[Path, ...] | SoundStream | Audio
 
 
 def as_sound(given: SoundInput | str | Sequence[str]) -> SoundInput:
-    """Return a path, several or a stream as such; one path in a sequence is that file."""
+    """Convert strings to paths; a sequence of one path is this file."""
     if isinstance(given, Path | SoundStream | Audio):
         return given
     paths = (Path(given),) if isinstance(given, str) else tuple(map(Path, given))
@@ -426,7 +426,7 @@ def as_sound(given: SoundInput | str | Sequence[str]) -> SoundInput:
 
 
 def path_of(sound: SoundInput) -> Path:
-    """Return the name of a recording: its file, the first of several, that of a stream."""
+    """Return the name of a recording: its file, the first of several files, or the name of a stream."""
     if isinstance(sound, SoundStream):
         return Path(sound.name)
     if isinstance(sound, Audio):
@@ -435,7 +435,7 @@ def path_of(sound: SoundInput) -> Path:
 
 
 class PcmAudio(Audio):
-    """A pipe that is being read; `frames` counts what has been read."""
+    """Sound of an open pipe; `frames` is the number of samples read so far."""
 
     def __init__(self, raw: RawPcm) -> None:
         self._raw = raw
@@ -443,24 +443,24 @@ class PcmAudio(Audio):
         self.sample_rate_hz, self.channels, self.frames = raw.sample_rate_hz, raw.channels, 0
         data = self._read_bytes(raw.sample_rate_hz)
         if data.startswith(_MAGIC):
-            raise InputFileError(self.path, "expected samples without a header, got a file: name it as INPUT")
+            raise InputFileError(self.path, "expected samples without a header, got a file: give it as INPUT")
         raw.check_encoding(data)
         self._first = self._block(data)
         self.silent_channels = constant_channels(self._first)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
-        """Yield the samples up to the end of the stream in blocks of `frames`; the last may be shorter."""
+        """Yield the samples until the stream ends in blocks of `frames`; the last one may be shorter."""
         yield from (self._first[start : start + frames] for start in range(0, len(self._first), frames))
         while data := self._read_bytes(frames):
             yield self._block(data)
 
     def close(self) -> None:
-        """Leave the stream to its owner."""
+        """Do nothing: the owner closes the stream."""
 
     def _read_bytes(self, frames: int) -> bytes:
         wanted = frames * self._raw.frame_bytes
         parts: list[bytes] = []
-        # A pipe gives what it holds, which may be less than a block.
+        # A pipe returns the available data, which may be less than a block.
         while (missing := wanted - sum(map(len, parts))) and (data := self._raw.stream.read(missing)):
             parts.append(data)
         joined = b"".join(parts)
@@ -478,11 +478,11 @@ class PcmAudio(Audio):
 
 
 class ChosenChannels(Audio):
-    """Some channels of an open recording, counted from 1, in an order of their own."""
+    """Selected channels of an open recording, counted from 1, in any order."""
 
     def __init__(self, audio: Audio, channels: Sequence[int]) -> None:
         if max(channels) > audio.channels:
-            expected = f"expected at least {max(channels)} channels, the largest number that is chosen"
+            expected = f"expected at least {max(channels)} channels, the largest selected number"
             raise InputFileError(audio.path, f"{expected}, got {audio.channels}")
         self._audio, self._taken = audio, [channel - 1 for channel in channels]
         self.path, self.sample_rate_hz, self.frames = audio.path, audio.sample_rate_hz, audio.frames
@@ -490,12 +490,12 @@ class ChosenChannels(Audio):
         self.silent_channels = tuple(i for i, channel in enumerate(channels, 1) if channel in silent)
 
     def check_size(self, expect_channels: int | None) -> None:
-        """Refuse another number of channels than microphones, and less than a second."""
+        """Refuse another number of channels than microphones, or less than one second."""
         self.check_channels(expect_channels)
         self._audio.check_size(None)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
-        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+        """Yield the recording from its start in blocks of `frames` samples; the last one may be shorter."""
         for block in self._audio.blocks(frames):
             self.frames = self._audio.frames
             yield block.take(self._taken, axis=1)
@@ -506,7 +506,7 @@ class ChosenChannels(Audio):
 
 
 class MonoFiles(Audio):
-    """Files of one channel each, read side by side."""
+    """Files of one channel each, read together."""
 
     def __init__(self, sources: Sequence[AudioSource]) -> None:
         self._sources = tuple(sources)
@@ -522,7 +522,7 @@ class MonoFiles(Audio):
                 raise InputFileError(other.path, f"expected {expected}, got {got}")
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
-        """Yield the recording from its start in blocks of `frames` samples; the last may be shorter."""
+        """Yield the recording from its start in blocks of `frames` samples; the last one may be shorter."""
         yield from map(np.hstack, zip(*(source.blocks(frames) for source in self._sources), strict=True))
 
     def close(self) -> None:
@@ -538,32 +538,32 @@ def open_sound(
     channels: Sequence[int] = (),
     strict: bool = True,
 ) -> Audio:
-    """Open whatever a recording stands in, checked as `open_audio` does.
+    """Open a recording of any kind, with the checks of `open_audio`.
 
     Parameters
     ----------
     sound : Path, tuple of Path, SoundStream or Audio
-        A multichannel file, files of one channel each in the order of the microphones, a stream, or what is
-        open already.
+        A multichannel file, files of one channel each in the order of the microphones, a stream, or an open
+        recording.
     expect_channels : int, optional
-        Number of microphones of the array that it shall fit.
+        Required number of channels: the microphones of the array.
     channels : sequence of int, optional
-        `MicrophoneArray.channels`, where there are others beside them. A recording of so many channels that
-        has not all of these is taken as it is: they were chosen when it was made.
+        `MicrophoneArray.channels`, if there are other channels. A recording that has as many channels but not
+        all of these numbers is used unchanged, because they were selected when it was made.
     strict : bool
-        As `open_audio`.
+        As for `open_audio`.
 
     Returns
     -------
     Audio
-        Open, at its start.
+        The open recording, at its start.
 
     Raises
     ------
     InputFileError
-        As `open_audio`; of mono files, if rates or lengths differ; if there is no such channel.
+        As for `open_audio`; also if rates or lengths of mono files differ, or a channel does not exist.
     SilentChannelsError
-        Channels constant over the first second.
+        If channels are constant during the first second.
 
     Examples
     --------
@@ -580,12 +580,12 @@ def open_sound(
         audio.check_size(expect_channels)
         if not isinstance(sound, Audio):
             audio.check_silence(strict)
-        opened.pop_all()  # what is fit to be read stays open
+        opened.pop_all()  # a valid recording stays open
     return audio
 
 
 def _unchecked(sound: Path | tuple[Path, ...] | SoundStream, opened: ExitStack) -> Audio:
-    """Open what can be read, whatever is silent, on the stack that closes it."""
+    """Open a recording on the stack, also with silent channels."""
     if isinstance(sound, SoundStream):
         return opened.enter_context(sound.open())
     if isinstance(sound, Path):

@@ -169,7 +169,7 @@ def test_four_bytes_a_sample_are_never_heard_as_three(
     raw = RawPcm(io.BytesIO(data), RATE_HZ, channels, read_as)
     certain = read_as in ("s24", "f32") or (encoding == "f32" and read_as in ("s16", "s32", "s24_32"))
     if certain and read_as != encoding:
-        with pytest.raises(InputFileError, match=f"got such as those of {encoding}"):
+        with pytest.raises(InputFileError, match=f"got samples like those of {encoding}"):
             open_sound(raw)
     elif read_as == encoding:
         open_sound(raw)
@@ -223,7 +223,7 @@ def test_sound_of_one_form_is_heard_as_no_other(
 @pytest.mark.parametrize("kind", ["WAV", "RF64", "W64"])
 def test_a_file_on_standard_input_is_no_raw_sound(tmp_path: Path, kind: str) -> None:
     soundfile.write(tmp_path / "a", noise(), RATE_HZ, format=kind, subtype="PCM_16")
-    with pytest.raises(InputFileError, match="name it as INPUT"):
+    with pytest.raises(InputFileError, match="give it as INPUT"):
         open_sound(RawPcm(io.BytesIO((tmp_path / "a").read_bytes()), RATE_HZ, 3, "s16"))
 
 
@@ -235,7 +235,7 @@ def test_a_header_that_names_another_form_is_refused(tmp_path: Path, held: str) 
     kind = struct.pack("<H", 1 if held == "floats" else 3)
     path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 1, 3), kind + struct.pack("<H", 3), 1))
     path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 12, 24), struct.pack("<HH", 12, 32), 1))
-    with pytest.raises(InputFileError, match=r"got such as those of|finite"):
+    with pytest.raises(InputFileError, match=r"got samples like those of|finite"):
         open_audio(path)
 
 
