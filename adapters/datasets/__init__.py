@@ -1,1 +1,1 @@
-"""Data sets in OVAD's layout and tables of feature windows."""
+"""Data sets in the layout of OVAD, and tables of feature windows."""

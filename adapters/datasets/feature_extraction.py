@@ -1,4 +1,4 @@
-"""Labelled one-second windows of recordings, from a list or from OVAD's layout, and their features."""
+"""Labelled one-second windows of recordings, from a list or a data set, and their features."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -34,16 +34,16 @@ class LabelledWindow:
     label: str
     environment: str
     recording: str
-    t0_frame: int | None  # Line-of-sight entry, frame number at 10 a second
+    t0_frame: int | None  # Line-of-sight entry, frame number at 10 per second
     path: Path  # Sound file
-    end_s: float | None  # End of the window in its file, seconds; None where the file ends
+    end_s: float | None  # End of the window in its file, seconds; None for the end of the file
 
 
 def read_labels(path: str | Path, dataset: str | Path) -> list[LabelledWindow]:
-    """Read which window of which recording carries which label."""
-    # Columns ID, Class, Environment and Recording ID as in the feature table, with these beside them where
-    # wanted: File, relative to the data set; End, seconds from the start of the file; T0. Where no File is
-    # given, `<Environment>/<Class>/<ID>/out_multi.wav` and `<ID>.wav` are looked for.
+    """Read the windows of recordings and their labels."""
+    # Columns ID, Class, Environment and Recording ID as in the feature table. Optional are File, relative to
+    # the data set; End, seconds from the start of the file; and T0. Without File, the paths
+    # `<Environment>/<Class>/<ID>/out_multi.wav` and `<ID>.wav` are tried.
     name, root = Path(path), Path(dataset)
     windows = [_labelled(name, root, line, row) for line, row in read_rows(name, REQUIRED, OPTIONAL)]
     if not windows:
@@ -59,12 +59,12 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
     windows : list of LabelledWindow
         From `read_labels`.
     array : MicrophoneArray
-        In the order of the channels.
+        Array with microphones in the order of the channels.
 
     Yields
     ------
     ndarray, shape (60,)
-        One after the other.
+        The features in the order of the windows.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def read_windows(
 def feature_table(
     windows: list[LabelledWindow], features: list[FloatArray], array: MicrophoneArray
 ) -> FeatureTable:
-    """Return windows and features, in the same order, as a table that names the array which heard them.
+    """Return windows and their features as a table with the domain of the array.
 
     Shapes: features (60,).
     """
@@ -125,12 +125,12 @@ def _rate_hz(path: Path) -> int:
 
 
 def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
-    """Return the second before the end of the window, shape (n, M)."""
+    """Return the last second before the end of the window, shape (n, M)."""
     rate, length = source.sample_rate_hz, round(WINDOW_S * source.sample_rate_hz)
     end = source.frames if window.end_s is None else round(window.end_s * rate)
     if end > source.frames or end < length:
         at = "" if window.end_s is None else f" before {window.end_s:g} s"
-        raise InputFileError(source.path, f"expected a second of sound{at}, got {source.duration_s:.3g} s")
+        raise InputFileError(source.path, f"expected 1 s of sound{at}, got {source.duration_s:.3g} s")
     return source.span(end - length, length)
 
 
@@ -163,22 +163,22 @@ def _sound_file(name: Path, root: Path, line: int, row: dict[str, str]) -> Path:
 
 
 def window_ends_s(label: str, t0_s: float, moving_ego: bool) -> dict[str, float]:
-    """Return by label when the windows of a recording end.
+    """Return the end of each window of a recording by label.
 
     Examples
     --------
     >>> window_ends_s("left", 7.0, moving_ego=False), window_ends_s("none", 7.0, moving_ego=True)
     ({'left': 7.0, 'front': 8.5}, {'none': 7.5})
     """
-    # With a standing ego the window of the recording's own label ends at T0, with a moving one 0.5 s later;
-    # an approach has a front window besides, which ends 1.5 s after that.
+    # The window of the recording's own label ends at T0 for a standing ego and 0.5 s later for a moving one.
+    # An approach also has a front window, which ends 1.5 s after that.
     end_s = t0_s + (MOVING_LATER_S if moving_ego else 0.0)
     return {label: end_s} if label == "none" else {label: end_s, FRONT: end_s + FRONT_LATER_S}
 
 
 def sample_windows(root: str | Path) -> tuple[list[LabelledWindow], int]:
-    """List the windows of every recording that ``DataLog.csv`` names."""
-    # Front windows are numbered among themselves, class number 0, as in the released list.
+    """List the windows of every recording in ``DataLog.csv``; count those outside their recordings."""
+    # Front windows are numbered separately with class number 0, as in the published list.
     windows: list[LabelledWindow] = []
     fronts = left_out = 0
     for order, recording in enumerate(OvadDataset(root).recordings):

@@ -1,8 +1,8 @@
-"""Tables of labelled feature windows, as released with OVAD: one row a window, 60 features and its origin.
+"""Tables of labelled feature windows, as published with OVAD: 60 features and the origin, one row per window.
 
 Columns: ``feat0`` to ``feat59``, ``Class`` (front, left, none, right), ``ID``, ``Environment`` (S.. standing
 ego, D.. moving ego), ``T0`` (frame number, may be empty) and ``Recording ID``. Azimuths run from -90 to 90
-degrees and grow to the right, as in the released data and in `frontend.direction.feature`.
+degrees and increase to the right, as in the published data and in `frontend.direction.feature`.
 """
 
 from collections.abc import Collection
@@ -31,19 +31,19 @@ _PREFIX = {"static": "S", "dynamic": "D", "all": ""}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureTable:
-    """Windows with their labels, row by row.
+    """Windows with their labels, one per row.
 
     Parameters
     ----------
     features : ndarray, shape (n, 60)
         2 segments x 30 azimuths.
     labels, ids, environments, recordings : ndarray of str, shape (n,)
-        Class, window ID, junction and recording of each window. A recording may hold a hazard window and a
-        front window: splits go by recording.
+        Class, window ID, junction and recording of each window. A recording may have a hazard window and a
+        front window, so data are split by recording.
     t0_frames : tuple of int or None
-        Line-of-sight entry, frame number at 10 a second; None where unknown.
+        Line-of-sight entry, frame number at 10 per second; None if unknown.
     domain : ModelDomain, optional
-        Array, rates and ego's motion of the windows; None where the file does not say.
+        Array, rates and ego motion of the windows; None if the file does not state them.
 
     Examples
     --------
@@ -67,27 +67,27 @@ class FeatureTable:
 
     @property
     def recording_keys(self) -> TextArray:
-        """Environment and recording of each window, as ``SA1/34``: what splits and overlaps go by."""
+        """Environment and recording of each window, such as ``SA1/34``, the unit of splits and overlaps."""
         return np.char.add(np.char.add(self.environments, "/"), self.recordings)
 
     @property
     def hazards(self) -> BoolArray:
-        """Where a window is labelled left or right."""
+        """Whether each window is labelled left or right."""
         return np.isin(self.labels, ("left", "right"))
 
     @property
     def hazard_free(self) -> BoolArray:
-        """Where a window is labelled none."""
+        """Whether each window is labelled none."""
         return np.asarray(self.labels == "none")
 
     def select(self, chosen: BoolArray) -> "FeatureTable":
-        """Return the rows where `chosen` is true."""
+        """Return the rows for which `chosen` is true."""
         kept = np.flatnonzero(chosen)
         rows: dict[str, Any] = {name: getattr(self, name)[kept] for name in _ROWS}
         return replace(self, t0_frames=tuple(self.t0_frames[i] for i in kept), **rows)
 
     def group(self, group: Group) -> "FeatureTable":
-        """Return the windows of a standing ego (static), a moving one (dynamic) or all.
+        """Return the windows of a standing ego (static), of a moving one (dynamic) or all.
 
         Raises
         ------
@@ -98,20 +98,20 @@ class FeatureTable:
         return self._not_empty(in_group, f"group: expected windows of group {group}")
 
     def joined(self, other: "FeatureTable") -> "FeatureTable":
-        """Return these windows and those of another table below them; the domain is this table's."""
+        """Return these windows followed by those of another table; the domain is that of this table."""
         both = self, other
         rows: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in both]) for name in _ROWS}
         return replace(self, t0_frames=self.t0_frames + other.t0_frames, **rows)
 
     def only(self, ids: Collection[str]) -> "FeatureTable":
-        """Return all windows of the recordings that hold a window of one of these IDs.
+        """Return all windows of the recordings with a window of one of these IDs.
 
         Raises
         ------
         InvalidArgumentError
             If there are none.
         """
-        return self._not_empty(self._of_recordings(ids), "ids: expected a window that is listed")
+        return self._not_empty(self._of_recordings(ids), "ids: expected a listed window")
 
     def without(self, ids: Collection[str]) -> "FeatureTable":
         """Return all windows of the other recordings.
@@ -121,7 +121,7 @@ class FeatureTable:
         InvalidArgumentError
             If none are left.
         """
-        return self._not_empty(~self._of_recordings(ids), "ids: expected a window that is not listed")
+        return self._not_empty(~self._of_recordings(ids), "ids: expected an unlisted window")
 
     def _not_empty(self, chosen: BoolArray, expected: str) -> "FeatureTable":
         if not chosen.any():
@@ -134,7 +134,7 @@ class FeatureTable:
 
 
 def read_features(path: str | Path) -> FeatureTable:
-    """Read a table of windows, and `FILE.csv.json` beside it, which says what they were made with.
+    """Read a table of windows, and its domain from `FILE.csv.json` if that exists.
 
     Parameters
     ----------
@@ -144,13 +144,13 @@ def read_features(path: str | Path) -> FeatureTable:
     Returns
     -------
     FeatureTable
-        In the order of the file.
+        The windows in the order of the file.
 
     Raises
     ------
     InputFileError
-        If the file is missing or too large, a column is missing, or a line does not hold 60 finite numbers, a
-        known class and an environment that begins with S or D; the message names file and line.
+        If the file is missing or too large, a column is missing, or a line lacks 60 finite numbers, a known
+        class or an environment that begins with S or D; the message contains file and line.
 
     Examples
     --------
@@ -175,16 +175,16 @@ def read_features(path: str | Path) -> FeatureTable:
 
 
 def write_features(path: str | Path, table: FeatureTable) -> None:
-    """Write a table of windows that `read_features` reads back to the bit, whole or not at all.
+    """Write a table of windows, atomically; `read_features` returns exactly the same values.
 
-    What they were made with goes to `FILE.csv.json`, so that other tools read the columns as they are.
+    The domain is written to `FILE.csv.json`, so that other tools can read the columns unchanged.
 
     Parameters
     ----------
     path : str or Path
-        Exactly this file.
+        File to write.
     table : FeatureTable
-        Windows.
+        Windows to write.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def _window(
 
 
 def t0_of(path: str | Path, line: int, row: dict[str, str]) -> int | None:
-    """Return the frame number T0 of a row, None where it has none."""
+    """Return the frame number T0 of a row, None without one."""
     try:
         return int(row["T0"]) if row.get("T0") else None
     except ValueError as error:

@@ -1,8 +1,8 @@
-"""Data sets in OVAD's layout: recordings with site, label and line-of-sight entry T0, and their array.
+"""Data sets in the layout of OVAD: recordings with site, label and line-of-sight entry T0, and their array.
 
-``<root>/DataLog.csv`` with the columns ID, Environment, Class and T0, and one folder a recording,
-``<root>/<environment>/<class>/<ID>/``, with ``out_multi.wav`` and, for a standing ego, camera detections.
-Where the vehicles of a simulated recording really were stands in its ``truth.json``.
+A data set has ``<root>/DataLog.csv`` with the columns ID, Environment, Class and T0, and one folder per
+recording, ``<root>/<environment>/<class>/<ID>/``, with ``out_multi.wav`` and, for a standing ego, camera
+detections. The ``truth.json`` of a simulated recording contains the true positions of the vehicles.
 """
 
 import logging
@@ -25,10 +25,10 @@ from worldstate.ground.typing import BoolArray, FloatArray
 
 LOG_NAME = "DataLog.csv"
 AUDIO_NAME = "out_multi.wav"
-ARRAY_NAME = "array.xml"  # Not of OVAD itself: the array of a data set, in its root
-# The data set's description names the first, its authors' code opens the second.
+ARRAY_NAME = "array.xml"  # Not part of OVAD: the array of a data set, in its root
+# The first is the name in the data set's description, the second that in its authors' code.
 DETECTION_NAMES = ("camera_baseline_results.json", "camera_baseline_detections.json")
-# Beside a simulated recording only.
+# Exists only for a simulated recording.
 TRUTH_NAME = "truth.json"
 COLUMNS = ("ID", "Environment", "Class", "T0")
 FRAME_RATE_HZ = 10.0
@@ -37,7 +37,7 @@ Label = Literal["left", "none", "right"]
 LABELS: dict[str, Label] = {label: label for label in get_args(Label)}
 
 MAX_T0_FRAME = 1_000_000
-# S or D for a standing or moving ego, then the junction: its type and number.
+# S or D for a standing or moving ego, then type and number of the junction.
 ENVIRONMENT = re.compile(r"[SD][A-Z][0-9]{1,3}", re.ASCII)
 T0 = re.compile(r"[0-9]{1,7}", re.ASCII)
 IDENTIFIER = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
@@ -46,7 +46,7 @@ IDENTIFIER = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 @final
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One recording and what is known of it.
+    """One recording with its labels.
 
     Parameters
     ----------
@@ -55,12 +55,13 @@ class Recording:
     recording_id : str
         Unique in the data set.
     environment : str or None
-        Such as ``"SA1"``: standing ego, junction A1. None where no log is there and the folder does not tell.
+        For example ``"SA1"``: standing ego, junction A1. None if there is no log and the folder has no such
+        name.
     label : str or None
-        Side that the vehicle comes from, or ``"none"``.
+        Side from which the vehicle comes, or ``"none"``.
     logged_frame : int or None
-        T0 of the log, frame number from the start; None where it is not known. Recordings without a vehicle
-        have one too, at which nothing happens.
+        T0 in the log, frame number from the start; None if unknown. Recordings without a vehicle also have a
+        T0, without an event.
 
     Examples
     --------
@@ -77,14 +78,14 @@ class Recording:
 
     @classmethod
     def open(cls, path: str | Path) -> "Recording":
-        """Find a recording from its folder alone, with its log where that stands three folders up.
+        """Open a recording by its folder, with the entry of a log three folders above if there is one.
 
         Raises
         ------
         InputFileError
-            If the folder or its sound is missing, the log is damaged or it contradicts the folder.
+            If the folder or its sound is missing, or the log is damaged or contradicts the folder.
         """
-        # A recording may be a link to another disk, so links are followed only where ".." asks for it.
+        # A recording may be a link to another disk, so links are resolved only if the path contains "..".
         folder = Path(path).resolve() if ".." in Path(path).parts else Path(path).absolute()
         if not (folder / AUDIO_NAME).is_file():
             raise InputFileError(path, f"expected a recording folder with {AUDIO_NAME}")
@@ -97,28 +98,28 @@ class Recording:
             return cls(folder, folder.name, environment, LABELS.get(folder.parent.name))
         if entry.path != folder:
             place = f"{entry.environment}/{entry.label}"
-            raise InputFileError(log, f"expected {folder.name} in {place}, as listed, found it at {path}")
+            raise InputFileError(log, f"expected {folder.name} in {place}, as listed, but found it at {path}")
         return entry
 
     @property
     def audio_path(self) -> Path:
-        """The sound: 56 channels of 24 bit at 47,998 Hz in OVAD."""
+        """The sound file: in OVAD, 56 channels of 24 bit at 47,998 Hz."""
         return self.path / AUDIO_NAME
 
     @property
     def detections_path(self) -> Path | None:
-        """Camera detections, None where there are none, as for every moving ego."""
+        """File of camera detections; None without one, as for every moving ego."""
         found = (self.path / name for name in DETECTION_NAMES)
         return next((path for path in found if path.is_file()), None)
 
     @property
     def moving_ego(self) -> bool | None:
-        """Whether the ego vehicle moves, None where not known."""
+        """Whether the ego vehicle moves; None if unknown."""
         return self.environment.startswith("D") if self.environment else None
 
     @property
     def t0_frame(self) -> int | None:
-        """Frame in which the vehicle enters line of sight; None without one, or where it is not known."""
+        """Frame in which the vehicle enters line of sight; None without a vehicle, or if unknown."""
         return None if self.label == "none" else self.logged_frame
 
     @property
@@ -127,17 +128,17 @@ class Recording:
         return None if self.t0_frame is None else self.t0_frame / FRAME_RATE_HZ
 
     def open_audio(self, expect_channels: int | None = None) -> AudioSource:
-        """Open the sound; raises what `adapters.audio.sound_file.open_audio` raises."""
+        """Open the sound, with the errors of `adapters.audio.sound_file.open_audio`."""
         return open_audio(self.audio_path, expect_channels)
 
     def read_detections(self) -> DetectionLog | None:
-        """Read the camera detections, None where there are none; raises what the reader raises."""
+        """Read the camera detections, None without any, with the errors of `read_detections`."""
         path = self.detections_path
         return None if path is None else read_detections(path, FRAME_RATE_HZ)
 
 
 class OvadDataset:
-    r"""All recordings that ``DataLog.csv`` lists, in its order.
+    r"""All recordings listed in ``DataLog.csv``, in its order.
 
     Parameters
     ----------
@@ -147,15 +148,15 @@ class OvadDataset:
     Attributes
     ----------
     root : Path
-        As given.
+        The given folder.
     recordings : tuple of Recording
-        Listed ones; their files are checked when they are opened.
+        The listed recordings; their files are checked only when they are opened.
 
     Raises
     ------
     InputFileError
-        If the log is missing or damaged: columns missing, an ID twice, an environment or class that is none,
-        T0 no integer.
+        If the log is missing or damaged: a missing column, a repeated ID, an invalid environment or class, or
+        a T0 that is not an integer.
 
     Examples
     --------
@@ -213,27 +214,29 @@ def choose_array(
 ) -> MicrophoneArray:
     """Return the array of a recording, a data set or a sound file, in the order of the channels.
 
-    `array.xml` beside the sound or in the root of its data set is right; an array given must be the same one,
-    and where it lists the same places in another order the data set's order counts. Without such a file the
-    array given is taken, then OVAD's for a folder, then the one assumed for a sound file.
+    `array.xml` beside the sound or in the root of its data set takes precedence. A given array must then have
+    the same positions; if their order differs, that of the data set is used. Without `array.xml`, the given
+    array is used, then OVAD's for a folder, or the assumed one for a sound file.
 
     Parameters
     ----------
     path : Path
         Data set, recording folder or sound file.
     given : MicrophoneArray, optional
-        By the user.
+        Array given by the user.
     assumed : MicrophoneArray, optional
-        For a sound file that nothing is known of, if it has as many channels; OVAD's where not given.
+        Array of a sound file without further information, if the number of channels matches; by default
+        OVAD's.
     trust_given : bool
-        Take the array given whatever the data set says.
+        Use the given array regardless of the data set.
 
     Raises
     ------
     OutOfDomainError
-        If the array given is not that of the data set.
+        If the given array is not that of the data set.
     InputFileError
-        If the data set's array is damaged, or a sound file has other channels than the array assumed.
+        If the data set's array is damaged, or a sound file has another number of channels than the assumed
+        array.
     """
     named = named_array(path)
     if given is not None and (named is None or trust_given):
@@ -252,7 +255,7 @@ def choose_array(
 
 
 def named_array(path: Path) -> Path | None:
-    """Return the file that names the array of a data set, recording or sound file, None without one."""
+    """Return the array file of a data set, recording or sound file, None without one."""
     folder = path if path.is_dir() else path.parent
     roots = [folder]
     if path.is_dir() or path.name == AUDIO_NAME:
@@ -261,12 +264,12 @@ def named_array(path: Path) -> Path | None:
 
 
 def check_channels(path: Path, array: MicrophoneArray) -> None:
-    """Refuse a sound file of which no array is named and that has other channels than the one assumed.
+    """Refuse a sound file without an array file that does not match the channels of the assumed array.
 
     Raises
     ------
     InputFileError
-        Then; the message says how to go on.
+        If the numbers differ; the message contains a remedy.
     """
     with open_audio(path, strict=False) as audio:
         if audio.channels != array.n_microphones:
@@ -277,7 +280,7 @@ def check_channels(path: Path, array: MicrophoneArray) -> None:
 
 
 def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
-    """Return the array that a sound file is taken to be of, if it has as many channels."""
+    """Return the array assumed for a sound file, if the number of channels matches."""
     check_channels(path, array)
     _LOG.warning("%s: no array is named; taken as %s, %d microphones", path, array.name, array.n_microphones)
     return array
@@ -285,7 +288,7 @@ def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueTrack:
-    """True azimuth and place of one vehicle over time, and when it was in line of sight."""
+    """True azimuth, position and line of sight of one vehicle over time."""
 
     time_s: FloatArray  # shape (n,): Camera frames, seconds from the start of the recording
     azimuth_rad: FloatArray  # shape (n,): Left positive
@@ -294,13 +297,13 @@ class TrueTrack:
 
     @property
     def visible_s(self) -> tuple[float, float] | None:
-        """First and last time in line of sight; None where the vehicle never is."""
+        """First and last time in line of sight; None without one."""
         seen = self.time_s[self.in_view]
         return (float(seen[0]), float(seen[-1])) if seen.size else None
 
 
 def read_true_tracks(folder: Path) -> tuple[TrueTrack, ...]:
-    """Read the tracks of all vehicles, none where the recording is not a simulated one."""
+    """Read the tracks of all vehicles; empty for a real recording."""
     path = folder / TRUTH_NAME
     if not path.is_file():
         return ()
