@@ -1,1 +1,1 @@
-"""The vehicle that carries the sensors: where they are, and how their clocks differ."""
+"""The vehicle that carries the sensors: their poses and clock offsets."""

@@ -1,4 +1,4 @@
-"""The sensors of a vehicle in one file: its array, its cameras and what they reported, odometry, model."""
+"""Car files: array, cameras with their detections, odometry and model of a vehicle in one file."""
 
 import logging
 import math
@@ -21,19 +21,19 @@ from worldstate.ground.checks import one_of
 from worldstate.ground.serialisation import ADDED
 
 _LOG = logging.getLogger(__name__)
-# No vehicle carries a sensor farther from its origin; such a number was written in millimetres.
+# No vehicle carries a sensor farther from its origin; a larger number is in millimetres.
 MAX_OFFSET_M = 30.0
 MOST_TURNS_DEG = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    r"""Pose of a sensor: position, and yaw about z, then pitch, then roll about the sensor's own axes.
+    r"""Pose of a sensor: position, then yaw about z, pitch and roll about the sensor's own axes.
 
     .. math:: p_{base} = t + R_z(yaw)\, R_y(-pitch)\, R_x(roll)\, p_{sensor}
 
-    Yaw is positive to the left. Pitch is positive upwards, as the elevation of what the sensor looks at: the
-    rotation about y, which points left, is its negative. Roll is positive where it lifts the left side.
+    Yaw is positive to the left. Pitch is positive upwards, like the elevation of the viewing direction; the
+    rotation about y, which points left, is its negative. Roll is positive if it lifts the left side.
 
     Examples
     --------
@@ -54,20 +54,20 @@ class Mounting:
         for axis, value in zip("xyz", self.position_m, strict=True):
             in_range(f"position_m.{axis}", value, -MAX_OFFSET_M, MAX_OFFSET_M)
         in_range("pitch_deg", self.pitch_deg, -90.0, 90.0)
-        for name in ("yaw_deg", "roll_deg"):  # which go round
+        for name in ("yaw_deg", "roll_deg"):  # may exceed one turn
             in_range(name, getattr(self, name), -MOST_TURNS_DEG, MOST_TURNS_DEG)
 
     @property
     def rotation(self) -> FloatArray:
-        """From the sensor's axes to those of `base_link`, shape (3, 3)."""
-        # Imported where it is used: most commands read no car file.
+        """Rotation from the sensor's axes to those of `base_link`, shape (3, 3)."""
+        # Imported here because most commands read no car file.
         from scipy.spatial.transform import Rotation
 
         angles_deg = self.yaw_deg, -self.pitch_deg, self.roll_deg
         return np.asarray(Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix())
 
     def applied(self, points_m: ArrayLike) -> FloatArray:
-        """Return points of the sensor, shape (n, 3), in `base_link`."""
+        """Convert points of the sensor, shape (n, 3), to `base_link`."""
         return np.asarray(finite_array("points_m", points_m, (None, 3)) @ self.rotation.T + self.position_m)
 
 
@@ -76,20 +76,20 @@ MOST_CAMERAS = 32
 
 @dataclass(frozen=True, slots=True)
 class CameraSetup:
-    """What belongs to a camera beside its lens: what its detector reported, and what of it counts.
+    """Settings of a camera other than its lens: detections, and which of them are used.
 
     Parameters
     ----------
     detections : Path, optional
-        What was detected in its images, as `read_any_detections` reads it.
+        Detections in its images, in a format of `read_any_detections`.
     image_rate_hz : float, optional
-        Images a second, where they carry no stamp; 10 where not given.
+        Images per second, if they have no stamps; by default 10.
     miss_rates : Path, optional
-        How often its detector misses, as `load_miss_rates` reads it.
+        Miss rates of its detector, in the format of `load_miss_rates`.
     boxes : DetectionFilter
-        Which boxes count.
+        Filter of the boxes.
     labels : tuple of str
-        Classes of its detector, where that is an ONNX model.
+        Classes of its detector if that is an ONNX model.
     """
 
     detections: Path | None = None
@@ -101,25 +101,26 @@ class CameraSetup:
 
 @dataclass(frozen=True, slots=True)
 class CarSensors:
-    """A vehicle as its file describes it, in the axes of `base_link` with the origin at the array.
+    """Sensors of a vehicle in the axes of `base_link`, with the origin at the array.
 
-    Sound has no range, so that azimuths are those at the array. What the file places about another origin,
-    such as the rear axle, is moved there.
+    Sound gives no range, so azimuths are those at the array. Positions that the file gives relative to
+    another origin, such as the rear axle, are converted.
 
     Parameters
     ----------
     array : MicrophoneArray or None
-        Turned as it is mounted; None where the file names none.
+        The array as mounted; None if the file has none.
     cameras : mapping of str to PinholeCamera
-        By name, in the order of the file; positions relative to the array.
+        Cameras by name in the order of the file, with positions relative to the array.
     setups : mapping of str to CameraSetup
-        What belongs to each of the cameras.
+        Further settings of each camera.
     model, odometry : Path, optional
         Model file and motion of the vehicle.
     measurements : mapping of str to Path
-        What other sensors recorded, such as a radar, by the name of the part that reads it.
+        Recordings of other sensors, such as a radar, by the name of the part that reads them.
     crossing_m : float
-        Metres ahead of the lane in which other stacks find a vehicle that is only heard.
+        Distance ahead, in metres, to the lane in which a vehicle detected only by sound is placed for other
+        stacks.
     """
 
     array: MicrophoneArray | None
@@ -131,12 +132,12 @@ class CarSensors:
     crossing_m: float = 9.0
 
     def camera(self, name: str | None = None) -> PinholeCamera | None:
-        """Return a camera by its name; without one the first, None where there is none.
+        """Return a camera by its name; by default the first one, None without cameras.
 
         Raises
         ------
         InvalidArgumentError
-            If there is no camera of that name.
+            If no camera has this name.
         """
         if name is None:
             return next(iter(self.cameras.values()), None)
@@ -144,16 +145,16 @@ class CarSensors:
 
 
 def read_car(path: str | Path) -> CarSensors:
-    """Read a vehicle from JSON.
+    """Read the sensors of a vehicle from JSON.
 
     ``{"array": {"file": "mics.csv", "position_m": [1.2, 0, 1.6], "pitch_deg": -5}, "cameras": [{"name":
     "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "position_m": [1.9, 0, 1.3]}]}``.
-    The array has a ``"file"`` as `read_array` reads it, beside the car file, or ``"positions_m"``; it is
-    mounted at ``"position_m"`` with ``"yaw_deg"``, ``"pitch_deg"`` and ``"roll_deg"`` (`Mounting`). Cameras
-    are as `read_camera` reads them, with a ``"name"`` and the keys of `CameraSetup`: ``"detections"``,
-    ``"image_rate_hz"``, ``"miss_rates"``, ``"classes"``, ``"min_score"``, ``"min_box_px"`` and ``"labels"``.
-    ``"model"``, ``"odometry"``, ``"measurements": {NAME: FILE}`` and ``"crossing_m"`` are those of
-    `CarSensors`. Every key is optional; files lie beside the car file.
+    The array has a ``"file"`` in a format of `read_array`, or ``"positions_m"``. It is mounted at
+    ``"position_m"`` with ``"yaw_deg"``, ``"pitch_deg"`` and ``"roll_deg"`` (`Mounting`). Each camera has the
+    keys of `read_camera`, a ``"name"`` and the keys of `CameraSetup`: ``"detections"``, ``"image_rate_hz"``,
+    ``"miss_rates"``, ``"classes"``, ``"min_score"``, ``"min_box_px"`` and ``"labels"``. ``"model"``,
+    ``"odometry"``, ``"measurements": {NAME: FILE}`` and ``"crossing_m"`` are those of `CarSensors`. Every key
+    is optional; paths are relative to the folder of the car file.
 
     Parameters
     ----------
@@ -163,13 +164,13 @@ def read_car(path: str | Path) -> CarSensors:
     Returns
     -------
     CarSensors
-        As the file says.
+        The sensors of the file.
 
     Raises
     ------
     InputFileError
-        If a file is missing, too large, no JSON, has a key that means nothing here, or a value is missing or
-        out of range; the message names the key.
+        If a file is missing, too large or not JSON, has an unknown key, or a value is missing or out of
+        range; the message contains the key.
 
     Examples
     --------
@@ -191,18 +192,18 @@ def read_car(path: str | Path) -> CarSensors:
 def write_aligned(
     path: str | Path, out: str | Path, camera: str | None, offset_s: float, yaw_deg: float
 ) -> None:
-    """Write a car file anew with an alignment added to one camera, the first without a name.
+    """Write a copy of a car file with an alignment added to one camera, by default the first.
 
     Raises
     ------
     InputFileError
-        If the car file cannot be read, or names its array beside it and the new one is elsewhere.
+        If the car file cannot be read, or has a relative path to its array and the copy is in another folder.
     InvalidArgumentError
-        If it has no such camera.
+        If no camera has this name.
     """
     car = read_car(path)
     if car.camera(camera) is None:
-        raise InputFileError(path, "expected a camera to align, it has none")
+        raise InputFileError(path, "expected a camera to align, but there is none")
     document: Any = read_json(path, "a car file")
     here, there = Path(path).absolute().parent, Path(out).absolute().parent
     file = (document.get("array") or {}).get("file")
@@ -215,12 +216,12 @@ def write_aligned(
 
 
 def read_camera_setup(path: str | Path) -> tuple[PinholeCamera, CameraSetup]:
-    """Read a camera from JSON as `read_camera` does, with the keys that a car file has for it.
+    """Read a camera from JSON as `read_camera` does, with the further keys of a car file.
 
     Raises
     ------
     InputFileError
-        As `read_camera`.
+        As for `read_camera`.
     """
     with refused_as_file(path):
         record = read_record(CameraRecord, path, "camera", by_hand=True)
@@ -229,7 +230,7 @@ def read_camera_setup(path: str | Path) -> tuple[PinholeCamera, CameraSetup]:
 
 @dataclass(frozen=True, slots=True)
 class _ArrayRecord:
-    """What a car file holds of its array."""
+    """Fields of the array in a car file."""
 
     file: str | None = None
     positions_m: tuple[tuple[float, float, float], ...] | None = None
@@ -239,7 +240,7 @@ class _ArrayRecord:
     roll_deg: float = field(default=0.0, metadata=ADDED)
 
     def array(self, path: Path) -> MicrophoneArray:
-        """Return the array as it is mounted."""
+        """Return the array as mounted."""
         if (self.file is None) == (self.positions_m is None):
             raise InvalidArgumentError("car.array: expected either file or positions_m")
         file = self.file
@@ -252,7 +253,7 @@ class _ArrayRecord:
 
 @dataclass(frozen=True, slots=True)
 class _CarFile:
-    """What a car file holds."""
+    """Fields of a car file."""
 
     array: _ArrayRecord | None = None
     cameras: tuple[CameraRecord, ...] = field(default=(), metadata=ADDED)
@@ -263,7 +264,7 @@ class _CarFile:
     crossing_m: float = field(default=9.0, metadata=ADDED)
 
     def car(self, path: Path) -> CarSensors:
-        """Return the car, its origin moved to the array."""
+        """Return the sensors with the origin at the array."""
         if len(self.cameras) > MOST_CAMERAS:
             got = len(self.cameras)
             raise InvalidArgumentError(f"car.cameras: expected at most {MOST_CAMERAS}, got {got}")
@@ -272,7 +273,7 @@ class _CarFile:
         for number, record in enumerate(self.cameras):
             where = f"car.cameras[{number}]"
             if not record.name or record.name in cameras:
-                raise InvalidArgumentError(f"{where}.name: expected one of its own, got {record.name!r}")
+                raise InvalidArgumentError(f"{where}.name: expected a unique name, got {record.name!r}")
             with _placed_at(where):
                 origin_m = (0.0, 0.0, 0.0) if self.array is None else self.array.position_m
                 cameras[record.name] = _relative(record, origin_m)
@@ -288,14 +289,14 @@ def _beside(folder: Path, file: str | None) -> Path | None:
 
 
 def _setup(record: CameraRecord, folder: Path) -> CameraSetup:
-    """Return what belongs to a camera, its files in a folder."""
+    """Return the further settings of a camera, with its files in a folder."""
     if (rate_hz := record.image_rate_hz) is not None:
         in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True)
     detections, rates = (_beside(folder, file) for file in (record.detections, record.miss_rates))
     in_range("camera.min_score", record.min_score, 0.0, 1.0)
     boxes = DetectionFilter(frozenset(record.classes), record.min_score)
     if record.min_box_px is not None:
-        # Of the camera's own images, where the filter counts in those of OVAD.
+        # Converted from the camera's images to those of OVAD, to which the filter refers.
         least_px = in_range("camera.min_box_px", record.min_box_px, 0.0, math.inf)
         boxes = replace(boxes, min_height_px=least_px * OVAD_HEIGHT_PX / record.height_px)
     return CameraSetup(detections, rate_hz, rates, boxes, record.labels)
@@ -304,7 +305,7 @@ def _setup(record: CameraRecord, folder: Path) -> CameraSetup:
 def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:
     """Return a camera with its position relative to the array."""
     if record.position_m is None:
-        return record.camera()  # which refuses it
+        return record.camera()  # raises the error
     there = Mounting(record.position_m).position_m
     x, y, z = (one - origin for one, origin in zip(there, array_m, strict=True))
     return replace(record, position_m=(x, y, z)).camera()
@@ -312,7 +313,7 @@ def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> Pinh
 
 @contextmanager
 def _placed_at(where: str) -> Iterator[None]:
-    """Let refusals name the part of the file that they are about."""
+    """Add the part of the file to the message of an error."""
     try:
         yield
     except InvalidArgumentError as error:
