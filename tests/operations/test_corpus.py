@@ -296,7 +296,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("named", OTHERS)
 def test_a_folder_that_was_begun_in_another_way_is_refused(named, corpus, options, heard):
-    with pytest.raises(InputFileError, match=f"begun with, got {named}: another --out"):
+    with pytest.raises(InputFileError, match=f"settings of its first run, got {named}: another --out"):
         hear(corpus, heard, **options | OTHERS[named])
 
 

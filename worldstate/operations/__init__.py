@@ -1,4 +1,4 @@
-"""What users do with recordings of their own: train, calibrate, inspect, draw."""
+"""Operations on users' own recordings: train, calibrate, inspect, draw."""
 
 import lazy_loader
 

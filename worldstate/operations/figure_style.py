@@ -1,4 +1,4 @@
-"""One style for all figures: fonts, colours by meaning, legends beside the data, rows of bars."""
+"""Common style of all figures: fonts, colours by meaning, legends beside the data, rows of bars."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,18 +18,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".svg", ".pdf")
-# Hops further apart than this are not joined by a line: one may be missing.
+# Hops farther apart than this are not joined by a line, because one may be missing.
 HOP_S = 0.1
 GAP_S = 2.5 * HOP_S
-# 150 dots an inch: a figure 9 inches wide is 1350 pixels, and still sharp at the 830 of a README page.
+# At 150 dots per inch a figure 9 inches wide has 1350 pixels, and is still sharp at the 830 of a README page.
 _DPI = 150
-# A colour has one meaning in all figures. Those of Okabe and Ito and an indigo: by simulation of the three
-# deficiencies of colour vision no two come nearer than 17 in CIELAB, and each has a contrast of 3 on paper.
+# Each colour has one meaning in all figures. They are colours of Okabe and Ito and an indigo: in simulations
+# of the three colour vision deficiencies any two differ by at least 17 in CIELAB, and each has a contrast of
+# 3 on paper.
 HIDDEN, IN_VIEW, SEARCHED = "#D55E00", "#0072B2", "#009E73"
 HEARD, TRUTH, DECISION = "#CC79A7", "black", "#332288"
-# Sides differ by dashes, in the order of the context's directions, never by colour.
+# Sides differ by line style, in the order of the context's directions, never by colour.
 SIDE_DASHES = ("-", "--", "-.", ":")
-# Of what is none of these, such as methods and faults; no two come nearer than 22.
+# Colours for everything else, such as methods and faults; any two differ by at least 22.
 CATEGORIES = ("#4D4D4D", "#E69F00", "#56B4E9", "#AA4499", "#997700", "#A6A6A6")
 _STYLE = {
     "font.size": 10.0,
@@ -40,12 +41,12 @@ _STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "lines.linewidth": 1.5,
-    "svg.hashsalt": "worldstate",  # else every SVG of the same figure is another file
+    "svg.hashsalt": "worldstate",  # otherwise equal figures give different SVG files
 }
 
 
 def check_suffix(path: Path) -> Path:
-    """Return `path` if a figure can be written under this name; commands call it before their work.
+    """Return `path` if a figure can be written under this name; commands check it before their work.
 
     Examples
     --------
@@ -60,7 +61,7 @@ def check_suffix(path: Path) -> Path:
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Draw in the style of the library, and leave the caller's own matplotlib settings alone."""
+    """Draw in the style of the library without changing the caller's matplotlib settings."""
     check_extra("matplotlib")
     import matplotlib
     from cycler import cycler
@@ -72,7 +73,7 @@ def figure_style() -> Iterator[None]:
 
 @contextmanager
 def figure_file(path: Path, width_in: float, height_in: float) -> Iterator["Figure"]:
-    """Lend an empty figure; it is written, whole, when the block ends without an error."""
+    """Yield an empty figure, which is written atomically if the block ends without an error."""
     check_suffix(path)
     from matplotlib.figure import Figure
 
@@ -84,7 +85,7 @@ def figure_file(path: Path, width_in: float, height_in: float) -> Iterator["Figu
 
 
 def legend_beside(axes: "Axes", title: str | None = None) -> None:
-    """Put the legend to the right of the axes, where it hides no data; one entry a label."""
+    """Put the legend to the right of the axes, where it hides no data, with one entry per label."""
     handles, labels = axes.get_legend_handles_labels()
     once = dict(zip(labels, handles, strict=True))
     axes.legend(
@@ -95,7 +96,7 @@ def legend_beside(axes: "Axes", title: str | None = None) -> None:
 def draw_power(
     axes: "Axes", time_s: FloatArray, azimuths_rad: FloatArray, power: FloatArray, label: str
 ) -> None:
-    """Draw power over azimuth, relative to its median, in grey, with a scale above.
+    """Draw power over azimuth, relative to its median, in grey, with a scale above it.
 
     Shapes: time_s (n,), azimuths_rad (a,), power (n, a).
     """
@@ -109,7 +110,7 @@ def draw_power(
 def draw_bars(
     axes: "Axes", time_s: ArrayLike, on: ArrayLike, row: int, color: str, height: float = 0.8
 ) -> None:
-    """Draw a bar in a row of its own for every stretch of hops; a decision holds until the next one.
+    """Draw a bar for every run of hops in one row; each decision is valid until the next one.
 
     Shapes: time_s, on (n,).
     """
@@ -121,13 +122,13 @@ def draw_bars(
 
 
 def name_rows(axes: "Axes", names: Sequence[str]) -> None:
-    """Name the rows of bars and marks, the first one lowest."""
+    """Label the rows of bars and marks, the first one lowest."""
     axes.set(yticks=range(len(names)), yticklabels=names, ylim=(-0.6, len(names) - 0.4))
     axes.tick_params(axis="y", length=0)
 
 
 def with_gaps(rows: FloatArray) -> FloatArray:
-    """Put a row of NaN where rows lie further apart in time, so that no line is drawn across.
+    """Insert a row of NaN where rows are far apart in time, so that no line is drawn across the gap.
 
     Shapes: rows (n, columns), the first column the time, seconds.
     """

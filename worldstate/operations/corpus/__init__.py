@@ -1,1 +1,1 @@
-"""Many recordings: heard over processes or machines, kept as Parquet, counted."""
+"""Evaluation of many recordings by several processes or computers, with results as Parquet tables."""

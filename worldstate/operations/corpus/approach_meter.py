@@ -1,4 +1,4 @@
-"""States of one recording in, its approaches and its hours by the state of the sensors out."""
+"""Summary of one recording's states: its approaches, and its hours by state of the sensors."""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -12,15 +12,15 @@ from worldstate.state import Entity, RiskCue, WorldState
 
 from .corpus_tables import SINCE_1970_S, HeardApproach, HeardRecording, StateHours
 
-# An advisory says that a vehicle comes into view within the risk's horizon.
+# An advisory predicts that a vehicle comes into view within the risk's horizon.
 _HORIZON_S = COMING_S[-1]
 LEFT_OUT = "left out by the cascade"
-_LOOKED_NS = nanoseconds(0.5)  # An older look was not at this hop
+_LOOKED_NS = nanoseconds(0.5)  # Maximum age of a look at a hop
 
 
 @dataclass(slots=True)
 class ApproachMeter:
-    """Counts what goes by and keeps a row for each approach, none of the states.
+    """Counts states and collects a row per approach, without storing the states.
 
     Examples
     --------
@@ -41,11 +41,11 @@ class ApproachMeter:
     _hops: Counter[tuple[str, str | None]] = field(default_factory=Counter)
     _onsets: Counter[tuple[str, str | None]] = field(default_factory=Counter)
     _rows: list[HeardApproach] = field(default_factory=list)
-    _standing: dict[str | None, int] = field(default_factory=dict)  # Rows of advisories that stand, by side
+    _standing: dict[str | None, int] = field(default_factory=dict)  # Rows of active advisories, by side
     _in_view: dict[str, int] = field(default_factory=dict)  # Rows of vehicles that came into view
 
     def update(self, state: WorldState) -> None:
-        """Take in the next state."""
+        """Process the next state."""
         self.first_ns = state.stamp_ns if self.first_ns is None else self.first_ns
         self.last_ns = state.stamp_ns
         self.usable += bool(state.cues) and all(cue.usable for cue in state.cues)
@@ -84,7 +84,7 @@ class ApproachMeter:
         self._rows[at] = replace(self._rows[at], gone_s=now_s, label=label)
 
     def _announced(self, side: str | None, now_s: float) -> int:
-        """Return the row of the advisory that announced a vehicle from this side, else a new one."""
+        """Return the row of the advisory that announced a vehicle from this side, or a new row."""
         for at, one in reversed([*enumerate(self._rows)]):
             if one.side == side and one.seen_s is None and one.end_s is not None:
                 if now_s - one.end_s <= _HORIZON_S:
@@ -94,7 +94,7 @@ class ApproachMeter:
         return len(self._rows) - 1
 
     def cascaded(self, kept: BoolArray, sampled: bool) -> None:
-        """Count the hops that a cascade left out or, of a recording heard whole, which approaches it kept."""
+        """Count the skipped hops of a cascade; if all were processed, mark the approaches that it keeps."""
         if not sampled:
             self._hops["", LEFT_OUT] += round(float((~kept).sum()) / HOP_S)
             return
@@ -111,7 +111,7 @@ class ApproachMeter:
         return HeardRecording(self.name, self.site, content, first_s, last_s, *counts, self.budget)
 
     def approaches(self) -> list[HeardApproach]:
-        """Return the approaches in the order in which they began."""
+        """Return the approaches in the order of their starts."""
         return self._rows
 
     def hours(self) -> list[StateHours]:
@@ -126,7 +126,7 @@ class ApproachMeter:
 
 
 def sensors_of(state: WorldState) -> str:
-    """Return the condition of every sensor in words.
+    """Describe the condition of every sensor in words.
 
     Examples
     --------
@@ -138,7 +138,7 @@ def sensors_of(state: WorldState) -> str:
 
 
 def _unheard(state: WorldState) -> str | None:
-    """Return why no advisory could be raised by sound, None if one could, or if no source states it."""
+    """Return why no advisory could be raised by sound; None if one could, or if no source gives a reason."""
     if state.no_model is not None:
         return "no model"
     if not state.heard or any(one.share >= LEAST_HEARD for one in state.heard):
@@ -147,10 +147,10 @@ def _unheard(state: WorldState) -> str | None:
 
 
 def alarm_level(state: WorldState, side: str, denied: float, alarm: SequenceAlarm) -> float | None:
-    """Return the threshold up to which the alarm of a side is raised; None if too little was heard or below.
+    """Return the highest threshold at which the alarm of a side would be raised; None if there is none.
 
-    It is what the filter compares, less what raises its threshold just then; below the risk `denied` no
-    threshold raises one.
+    It is the value that the filter compares with its threshold, less the current increase of that threshold.
+    It is None below the risk `denied`, or if there was too little sound.
     """
     own = (cue for cue in state.cues if cue.direction == side)
     cue = next((cue for cue in own if (cue.risk or 0.0) >= denied), None)

@@ -1,7 +1,7 @@
-"""The first stage of a cascade: which seconds of a recording are worth hearing, by four of its microphones.
+"""First stage of a cascade, which selects the seconds of a recording to process, from four microphones.
 
-A second counts if its level or the coherence of the four exceeds the usual of the recording; the seconds
-before it, of which a sequence is read, and after it are heard as well.
+A second is selected if its level or the coherence of the four microphones exceeds the recording's usual
+value. The seconds before it, which the sequence needs, and after it are also processed.
 """
 
 import numpy as np
@@ -14,18 +14,18 @@ from worldstate.ground import TINY
 from worldstate.ground.typing import BoolArray, FloatArray
 
 # Ten simulated minutes of a calm street (SB1, seed 5) and of a town (TA1, seed 6) with seven microphones:
-# these keep 0.27 and 0.56 of the seconds, 7 of 7 and 25 of 25 onsets, the two seconds before T0 of 9 of 9 and
-# 32 of 36 vehicles; 2 dB and 0.05 keep 0.46 and 0.68, the same onsets, 9 and 34 vehicles.
+# these values keep 0.27 and 0.56 of the seconds, 7 of 7 and 25 of 25 onsets, and the 2 s before T0 of 9 of 9
+# and 32 of 36 vehicles. With 2 dB and 0.05 it is 0.46 and 0.68, the same onsets, and 9 and 34 vehicles.
 LOUDER_DB, MORE_COHERENT, USUAL = 3.0, 0.08, 20.0  # The last is a percentile of the seconds
 BEFORE_S, AFTER_S = 3, 2  # A sequence has three seconds
 _MICROPHONES, _BAND_HZ = 4, (150.0, 1500.0)
 _FRAME_S = 0.04
-# One recording in so many is heard whole, and tells which of its approaches the cascade would have kept.
+# One recording in this many is processed fully, to measure which of its approaches the cascade keeps.
 SAMPLED = 20
 
 
 def kept_seconds(source: Source) -> BoolArray:
-    """Return which seconds of a recording are worth hearing, shape (n,)."""
+    """Return which seconds of a recording are selected, shape (n,)."""
     told, n_microphones = [], source.array.n_microphones
     with open_sound(source.sound, n_microphones, channels=source.array.channels, strict=False) as audio:
         rate_hz = audio.sample_rate_hz
@@ -41,7 +41,7 @@ def kept_seconds(source: Source) -> BoolArray:
 
 def _level_and_coherence(frames: np.ndarray) -> FloatArray:
     r"""Return the level in dB and the mean over bins and pairs of :math:`|S_{mn}| / \sqrt{S_{mm} S_{nn}}`."""
-    if not len(frames):  # The last block may hold less than a frame
+    if not len(frames):  # The last block may be shorter than a frame
         return np.zeros(2)
     cross = np.abs(cross_spectra(frames.transpose(1, 0, 2)))
     powers = np.diagonal(cross, axis1=1, axis2=2)

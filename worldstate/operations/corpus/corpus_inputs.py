@@ -1,4 +1,4 @@
-"""The recordings of a corpus, below a folder or in a manifest, and a digest of what each holds."""
+"""Recordings of a corpus, in a folder or listed in a manifest, and a digest of their contents."""
 
 import hashlib
 import itertools
@@ -13,7 +13,7 @@ from worldstate.adapters.files.file_io import plain_file, read_rows
 from worldstate.adapters.ros.bag_input import METADATA_NAME, STORAGE_SUFFIXES
 from worldstate.ground import InputFileError, in_range
 
-CARD_NAME = "corpus.json"  # In the folder that `hear` wrote
+CARD_NAME = "corpus.json"  # In the output folder of `hear`
 LOG_SUFFIX = ".jsonl"  # Snapshots of `worldstate run` or `live`
 _SUFFIXES = {".wav", ".rf64", ".w64", ".flac", LOG_SUFFIX, *STORAGE_SUFFIXES}
 
@@ -28,26 +28,26 @@ class CorpusInput:
     'monday'
     """
 
-    name: str  # Path below the folder, or as the manifest has it
+    name: str  # Path relative to the folder, or as in the manifest
     path: Path  # Sound file, recording folder, bag, or a log of snapshots
-    site: str  # Place or vehicle by which hours are counted
-    detections: Path | None = None  # Of its camera
+    site: str  # Place or vehicle by which hours are grouped
+    detections: Path | None = None  # Detections of its camera
     odometry: Path | None = None
 
     @property
     def key(self) -> str:
-        """A digest of the name: the first part of the names of its files."""
+        """Digest of the name, with which the names of its files start."""
         return hashlib.sha256(self.name.encode()).hexdigest()[:16]
 
     def digest(self) -> str:
-        """Return a digest of the name, the site and every byte of the files, the hexadecimal of SHA-256.
+        """Return the SHA-256 of the name, the site and every byte of the files, in hexadecimal.
 
         Raises
         ------
         InputFileError
             If a file cannot be read.
         """
-        # The list of a data set names the ego's motion, which chooses the model.
+        # The list of a data set contains the ego's motion, which selects the model.
         moves = Recording.open(self.path).moving_ego if (self.path / AUDIO_NAME).is_file() else None
         found = hashlib.sha256(f"{self.name}\0{self.site}\0{moves}".encode())
         for part in filter(None, (self.path, self.detections, self.odometry, named_array(self.path))):
@@ -64,16 +64,16 @@ def file_digest(path: Path) -> bytes:
 
 
 def find_corpus(path: Path) -> list[CorpusInput]:
-    r"""Return the recordings of a folder or a manifest, in the order of their names.
+    r"""Return the recordings of a folder or a manifest, sorted by name.
 
-    Below a folder these are sound files, bags, recording folders in OVAD's layout and logs of snapshots; the
-    site is the first folder on the way to it. A manifest is a CSV file with the column ``path``, relative to
+    Recordings in a folder are sound files, bags, recording folders in the layout of OVAD and logs of
+    snapshots; the site is the first subfolder. A manifest is a CSV file with the column ``path``, relative to
     its own folder, and optionally ``site``, ``detections`` and ``odometry``.
 
     Raises
     ------
     InputFileError
-        If there is no recording, or a manifest names one twice.
+        If there is no recording, or a manifest contains one twice.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def _listed(manifest: Path) -> Iterator[CorpusInput]:
 
 
 def share_of(inputs: Iterable[CorpusInput], number: int, of: int) -> list[CorpusInput]:
-    """Return the recordings of one of several machines, by the digest of their names.
+    """Return the recordings for one of several computers, by the digest of their names.
 
     Examples
     --------

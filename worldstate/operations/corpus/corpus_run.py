@@ -1,4 +1,4 @@
-"""A corpus heard: each recording once, by any number of processes or machines, into Parquet."""
+"""Processing of a corpus: each recording once, by any number of processes or computers, to Parquet."""
 
 import hashlib
 import json
@@ -41,34 +41,34 @@ from .cascade import SAMPLED, kept_seconds
 from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
 from .corpus_tables import TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_rows
 
-# Of the tables: a major version reads no other one's.
+# Version of the tables; each major version reads only its own.
 _SCHEMA = {"name": "worldstate.Corpus", "version": "1.0.0"}
 
 
 @dataclass(frozen=True, slots=True)
 class HeardShard:
-    """What became of one recording in a run."""
+    """Result of a run for one recording."""
 
     recording: str
     shard: str  # Name of its file in every table, without the suffix
-    status: str  # "heard"; "there" since another run; "failed"
+    status: str  # "heard"; "there" if from an earlier run; "failed"
     sound_s: float = 0.0
     failure: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class HearPlan:
-    """How every recording of a corpus is heard, and where its tables go."""
+    """Settings for every recording of a corpus, and the folder of its tables."""
 
     out: Path
     array: MicrophoneArray | None
     model: Path | None
     others: dict[str, Any]  # Further arguments of `open_source`
-    card: dict[str, Any]  # Of the folder; its digest is of all that decides the tables beside the recordings
+    card: dict[str, Any]  # Description of the folder, with a digest of everything but the recordings
 
     @classmethod
     def begun(cls, out: Path, hops: bool, cascade: bool, parts: CorpusParts) -> "HearPlan":
-        """Make the folder and return the plan; refuse a folder in which recordings were heard otherwise."""
+        """Create the folder and return the plan; refuse a folder that was created with other settings."""
         others: dict[str, Any] = {
             name: Path(one).absolute() if isinstance(one, Path | str) else one
             for name, one in parts.items()
@@ -77,11 +77,11 @@ class HearPlan:
         array: Any = parts.get("array")
         model: Any = parts.get("model")
         if isinstance(model, Model):
-            raise InvalidArgumentError("model: expected a file or the name of one that ships")
+            raise InvalidArgumentError("model: expected a file or the name of a shipped model")
         array = read_array(array) if isinstance(array, Path | str) else array
-        read_model(model, array=array)  # A wrong one is refused before the work
+        read_model(model, array=array)  # Refuses a wrong model before the work
         file = file_of_model(model, array)
-        # Whatever the file of an array is called, its microphones decide.
+        # The digest depends on the microphones of an array, not on its file name.
         decides = [__version__, hops, cascade, array and (array.positions_m, array.channels), file, others]
         text = json.dumps(decides, sort_keys=True, default=_plain)
         card: dict[str, Any] = {"schema": _SCHEMA, "version": __version__, "model": file.name}
@@ -94,14 +94,15 @@ class HearPlan:
         elif (known := read_json(out / CARD_NAME, "the card of a corpus")) != card:
             held = known if isinstance(known, dict) else {}
             other = {name: one for name, one in card.items() if held.get(name) != one and name != "digest"}
-            problem = f"expected what it was begun with, got {other or 'other options'}: another --out"
+            problem = f"expected the settings of its first run, got {other or 'other options'}: another --out"
             raise InputFileError(out / CARD_NAME, problem)
         return cls(out, array, model and file.absolute(), others, card)
 
     def shard(self, one: CorpusInput, content: str) -> str:
-        """Return the name of the files of a recording, by all that decides their bytes."""
+        """Return the file name of a recording, from everything that determines its bytes."""
         whole = hashlib.sha256(f"{self.card['digest']} {content}".encode()).hexdigest()[:32]
-        # Without a content it could not be read, for a reason that may pass: the next run tries again.
+        # A recording without content could not be read, perhaps temporarily, so that the next run tries
+        # again.
         return f"{one.key}-{whole if content else 'unread'}"
 
     def file(self, table: str, shard: str) -> Path:
@@ -110,7 +111,7 @@ class HearPlan:
 
 
 def _plain(value: Any) -> Any:
-    """Return what stands for a value in the text that a digest is made of."""
+    """Return a value for the text from which the digest is computed."""
     if is_dataclass(value):
         return [type(value).__name__, *(getattr(value, one.name) for one in fields(value))]
     if isinstance(value, Path):
@@ -130,11 +131,11 @@ def hear(
     on_recording: Callable[[HeardShard], object] = lambda shard: None,
     **parts: Unpack[CorpusParts],
 ) -> list[HeardShard]:
-    """Hear every recording of a corpus and write its approaches as Parquet.
+    """Process every recording of a corpus and write its approaches as Parquet.
 
-    A recording that was heard before is not heard again. Its files are named by a digest of its content, the
-    array, the model, the options and the version, and written whole or not at all; they are the same bytes
-    for any number of workers.
+    A recording that was processed before is skipped. The names of its files contain a digest of its content,
+    the array, the model, the options and the version. Files are written atomically, and their bytes do not
+    depend on the number of workers.
 
     Parameters
     ----------
@@ -142,38 +143,39 @@ def hear(
         Folder of sound files, bags, recording folders and logs of snapshots, or a manifest (CSV: path, site,
         detections, odometry).
     out : path
-        Folder of the tables ``recordings``, ``approaches``, ``hours`` and, if asked, ``hops``.
+        Folder of the tables ``recordings``, ``approaches``, ``hours`` and optionally ``hops``.
     jobs : int
-        Processes.
+        Number of processes.
     executor : Executor, optional
-        Works in place of processes: any of `concurrent.futures`, or Dask's ``client.get_executor()``; its
-        workers need the same files and the same folder `out`.
+        Replaces the processes: an executor of `concurrent.futures`, or Dask's ``client.get_executor()``. Its
+        workers need access to the same files and the same folder `out`.
     shard : (int, int)
-        Which of how many shares is heard, from 1, as one of several machines without an executor.
+        Number of this share, from 1, and of all shares, to distribute the work over computers without an
+        executor.
     hops : bool
-        Write a row for each hop as well, its snapshot included.
+        Also write a row per hop, with its snapshot.
     cascade : bool
-        Hear only the seconds in which level or coherence of four microphones is above the usual of the
-        recording, and those around them; one recording in twenty is heard whole, and the column ``kept`` of
-        its approaches gives the cascade's recall. Not with `hops`.
+        Process only the seconds in which the level or coherence of four microphones exceeds the usual value
+        of the recording, and those around them. One recording in twenty is processed fully, and the column
+        ``kept`` of its approaches gives the recall of the cascade. Not with `hops`.
     on_recording : callable
         Called after each recording, for progress.
     **parts
-        As `open_source` takes them: `array`, `camera`, `miss_rates`, `model`, `context`, `sides`, `budget`
-        or `alpha`, `settings`.
+        Arguments of `open_source`: `array`, `camera`, `miss_rates`, `model`, `context`, `sides`, `budget` or
+        `alpha`, `settings`.
 
     Returns
     -------
     list of HeardShard
-        What became of each recording, in the order of their names; one that could not be heard is a row of
-        ``recordings`` with its failure.
+        Result of each recording, sorted by name. A recording that failed has a row in ``recordings`` with the
+        failure.
 
     Raises
     ------
     InputFileError
-        If there is no recording, or `out` was begun in another way.
+        If there is no recording, or `out` was created with other settings.
     MissingExtraError
-        Without pyarrow, which the extra ``corpus`` brings.
+        If pyarrow is not installed (extra ``corpus``).
 
     Examples
     --------
@@ -188,7 +190,7 @@ def hear(
     """
     check_extra("pyarrow")
     if cascade and hops:
-        raise InvalidArgumentError("cascade: expected it without hops, it hears only some of them")
+        raise InvalidArgumentError("cascade: expected it without hops, because it skips some of them")
     inputs = share_of(find_corpus(Path(corpus).absolute()), *shard)
     plan = HearPlan.begun(Path(out).absolute(), hops, cascade, parts)
     former = defaultdict[str, list[Path]](list)
@@ -197,7 +199,7 @@ def hear(
     work, shards = partial(hear_recording, plan), []
     working = in_processes(work, inputs, jobs) if executor is None else in_executor(executor, work, inputs)
     for one, found in zip(inputs, working, strict=True):
-        # Of what a recording held before, no hour counts.
+        # Remove the tables of an earlier content of the recording, so that its hours are not added.
         for path in former[one.key]:
             if path.stem != found.shard:
                 path.unlink(missing_ok=True)
@@ -207,7 +209,7 @@ def hear(
 
 
 def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
-    """Hear one recording unless its files are there; its row in ``recordings`` is written last."""
+    """Process one recording unless its files exist; its row in ``recordings`` is written last."""
     content, row = "", None
     try:
         content = one.digest()
@@ -216,11 +218,11 @@ def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
         row = _hear(plan, one, content)
     except MissingExtraError:
         raise
-    except Exception as error:  # One of thousands: its failure is a row
+    except Exception as error:  # One failure among thousands of recordings becomes a row
         known = isinstance(error, WorldstateError)
         content = content if known else ""
         text = str(error) if known else f"{type(error).__name__}: {error}"
-        # In the same words wherever the corpus lies.
+        # Replace the path, so that the text does not depend on the location of the corpus.
         failure = " ".join(text.replace(str(one.path), one.name).split())
         row = HeardRecording(one.name, one.site, content, failure=failure)
     shard = plan.shard(one, content)
@@ -230,7 +232,7 @@ def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
 
 
 def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
-    """Hear one recording and write its tables; return its row."""
+    """Process one recording and write its tables; return its row."""
     meter, shard = ApproachMeter(one.name, one.site), plan.shard(one, content)
     if one.path.suffix == LOG_SUFFIX or is_own_mcap(one.path):
         for _, state in read_log(one.path):
@@ -251,14 +253,14 @@ def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
 
 
 def _hops(source: Source, meter: ApproachMeter) -> Iterator[HeardHop]:
-    """Yield the hops of a recording while the meter counts them."""
+    """Yield the hops of a recording, and update the meter."""
     alarm, denied = getattr(source.sequence, "alarm", None), (source.street or StreetModel()).death
     signature = None if source.model is None else signature_checksum(source.model)
     for step in listen_steps(source):
         meter.update(state := step.state)
         levels = [alarm and alarm_level(state, side, denied, alarm) for side in SIDES]
         columns = hop_stream([step.measurement], name=meter.name).columns
-        # No reference says what was in view beside what was seen.
+        # Without a reference, only detections show what was in view.
         heard = {name: columns[name][0].tolist() for name in STREAM_COLUMNS if name != "there"}
         about = meter.name, meter.site, state.risk, state.to_json(), signature
         yield HeardHop(*about, levels[0], levels[1], **heard)
@@ -278,5 +280,5 @@ def _source(plan: HearPlan, one: CorpusInput) -> Source:
 
 @cache
 def _model(path: Path) -> Model:
-    """Read a model once a process."""
+    """Read a model once per process."""
     return read_model(path)

@@ -1,7 +1,7 @@
-"""The tables of a corpus: typed rows, a Parquet file for each recording and table, written whole.
+"""Tables of a corpus: typed rows, with one Parquet file per recording and table, written atomically.
 
-Files hold neither the time of writing nor the name of a machine, and the same rows are the same bytes with
-one release of pyarrow.
+Files contain neither the time of writing nor a computer's name. With one release of pyarrow, equal rows give
+equal bytes.
 """
 
 import itertools
@@ -17,26 +17,26 @@ from worldstate.ground import InputFileError
 from worldstate.ground.extras import optional
 
 Row = TypeVar("Row")
-SINCE_1970_S = 1e9  # A stamp above it is no time since a first sample
+SINCE_1970_S = 1e9  # Larger stamps are times since 1970, not since the first sample
 
 
 @dataclass(frozen=True, slots=True)
 class HeardRecording:
-    """A recording that was heard, or why it could not be: table ``recordings``."""
+    """A processed recording, or why it failed: table ``recordings``."""
 
     recording: str  # Name in the corpus
     site: str
     content: str  # Digest of its bytes, name and site
-    # End of the first window, and of the last: from the first sample on, or of a bag from 1970 on.
+    # End of the first and of the last window, from the first sample; for a bag, since 1970.
     start_s: float | None = None
     end_s: float | None = None
     hops: int = 0
-    heard: int = 0  # Hops in which a hidden vehicle would have been noticed
-    looked: int = 0  # Hops in which a camera had looked
-    usable: int = 0  # Hops in which every cue may be acted on
-    onsets: int = 0  # Times an advisory of any side began while none stood
-    budget: float | None = None  # Onsets an hour that the alarm was set to; None if none is stated
-    failure: str | None = None  # Why it could not be heard
+    heard: int = 0  # Hops in which a hidden vehicle would have been detected
+    looked: int = 0  # Hops with a look of a camera
+    usable: int = 0  # Hops in which every cue is usable
+    onsets: int = 0  # Number of times an advisory of any side began while none was active
+    budget: float | None = None  # Onsets per hour for which the alarm is set; None if not stated
+    failure: str | None = None  # Why it failed
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +45,9 @@ class StateHours:
 
     recording: str
     site: str
-    day: str | None  # Of the first hop, UTC; None if times count from the first sample
+    day: str | None  # Day of the first hop, UTC; None if times start at the first sample
     sensors: str  # Condition of every sensor
-    unheard: str | None  # Why nothing could be heard; None if it could
+    unheard: str | None  # Why nothing could be detected by sound; None if it could
     hops: int
     onsets: int
 
@@ -59,17 +59,17 @@ class HeardApproach:
     recording: str
     site: str
     side: str | None
-    time_s: float | None = None  # When the advisory began; None without one
+    time_s: float | None = None  # Start of the advisory; None without one
     end_s: float | None = None  # Its last hop
-    chance: float | None = None  # That a vehicle comes into view within 8 s, as stated when it began
-    expected_s: float | None = None  # Time to visible, as stated then
-    seen: bool | None = None  # Whether a vehicle came into view; None if no camera looked
-    seen_s: float | None = None  # When
+    chance: float | None = None  # Initial probability that a vehicle comes into view within 8 s
+    expected_s: float | None = None  # Initial estimate of the time to visible
+    seen: bool | None = None  # Whether a vehicle came into view; None without a look of a camera
+    seen_s: float | None = None  # Time at which it came into view
     gone_s: float | None = None  # Last hop in which it was in view
-    lead_s: float | None = None  # From the advisory to its coming into view
-    label: str | None = None  # Likeliest class of the vehicle
-    usable: bool = False  # Whether the advisory could be acted on when it began
-    kept: bool | None = None  # Whether a cascade would have heard its beginning; None if that was not asked
+    lead_s: float | None = None  # From the advisory to the time at which it came into view
+    label: str | None = None  # Most probable class of the vehicle
+    usable: bool = False  # Whether the advisory was usable at its start
+    kept: bool | None = None  # Whether a cascade keeps its start; None if not determined
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,10 +80,10 @@ class HeardHop:
     site: str
     risk: float | None
     snapshot: str  # JSON
-    signature: int | None  # Checksum of the window model whose scores follow; None without a model
-    level_left: float | None  # Log-odds: the alarm is raised by thresholds up to it; None by no threshold
+    signature: int | None  # Checksum of the window model of the following scores; None without a model
+    level_left: float | None  # Log-odds: largest threshold that raises the alarm; None if none does
     level_right: float | None
-    # As of hop streams
+    # Columns of hop streams
     time_s: float
     log_likelihoods: tuple[float, ...]
     answer: int
@@ -94,7 +94,7 @@ class HeardHop:
 
 
 TABLES: Mapping[str, type] = {
-    # The last is written last: a recording counts as heard once it is there.
+    # `recordings` is written last: its row means that the recording is complete.
     "hops": HeardHop,
     "approaches": HeardApproach,
     "hours": StateHours,
@@ -104,7 +104,7 @@ _ARROW = {str: "string", float: "double", int: "int64", bool: "bool"}
 
 
 def write_rows(path: Path, kind: type, rows: Iterable[Any]) -> None:
-    """Write one file of a table, whole or not at all."""
+    """Write one file of a table, atomically."""
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     left, schema = map(asdict, rows), _schema(kind)
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, compression="zstd") as file:
@@ -113,19 +113,19 @@ def write_rows(path: Path, kind: type, rows: Iterable[Any]) -> None:
 
 
 def corpus_rows(out: Path, kind: type[Row]) -> Iterator[Row]:
-    """Yield the rows of a table of a corpus, of recordings that were heard to their end.
+    """Yield the rows of a table of a corpus, for completed recordings.
 
     Raises
     ------
     InputFileError
-        If it is no corpus, or a file is damaged or holds other columns.
+        If the folder is not a corpus, or a file is damaged or has other columns.
     """
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     table = next(name for name, one in TABLES.items() if one is kind)
     paths = sorted((out / "recordings").glob(f"[!.]*{PARQUET}"))
     if not paths:
         raise InputFileError(out, "expected the folder that `worldstate hear --out` wrote")
-    # What could not be heard has no other table.
+    # A recording that failed has no other table.
     for path in filter(Path.exists, (out / table / path.name for path in paths)):
         try:
             with parquet.ParquetFile(path) as file:
@@ -144,7 +144,7 @@ def _schema(kind: type) -> Any:
 
 def _field(name: str, hint: Any) -> Any:
     arrow = optional("pyarrow")
-    # Of "float | None" the first is the type of the values.
+    # In "float | None" the first is the type of the values.
     first = get_args(hint)[0] if isinstance(hint, UnionType) else hint
     of_list = get_origin(first) is tuple
     plain = arrow.type_for_alias(_ARROW[get_args(first)[0] if of_list else first])

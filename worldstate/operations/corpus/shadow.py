@@ -1,6 +1,6 @@
-"""A shadow week: hours in which every advisory counts as false, by site, day and state of the sensors.
+"""Shadow operation: onset rates by site, day and state of the sensors, with every advisory counted as false.
 
-An advisory about a vehicle that was there counts as well, so that the rates are upper bounds of false alarms.
+Advisories about real vehicles are also counted, so the rates are upper bounds of the false-alarm rate.
 """
 
 import math
@@ -18,8 +18,8 @@ from worldstate.operations.recordings.hop_table import HOP_S
 
 from .corpus_tables import StateHours
 
-_WHOLE = 1000.0  # Numbers from here on have no decimals, and no exponent
-# Rows of a table on the page; the others are in the tables of the corpus.
+_WHOLE = 1000.0  # Numbers from here on are printed without decimals or exponent
+# Largest number of rows in a table of the page; the tables of the corpus contain all.
 _MOST_ROWS = 40
 _GROUPS: Mapping[str, Callable[[StateHours], str]] = {
     "all": lambda row: "all recordings",
@@ -38,13 +38,13 @@ class ShadowHours:
     heard_hours: float
     unheard_hours: float
     onsets: int
-    onsets_per_hour: float | None  # Of the hours heard, and its exact 95 % interval; None without any
+    onsets_per_hour: float | None  # Per usable hour, with its exact 95 % interval; None without any
     low: float | None
     high: float | None
-    more_hours: float | None  # Until the interval lies below the budget; None if it never does
+    more_hours: float | None  # Hours until the interval is below the budget; None if it never is
 
     def __str__(self) -> str:
-        """Return it in one line."""
+        """Return the hours and the rate in one line."""
         rate = "no hour heard"
         if self.onsets_per_hour is not None:
             rate = f"{_cell(self.onsets_per_hour)} onsets/h [{_cell(self.low)}, {_cell(self.high)}]"
@@ -53,7 +53,7 @@ class ShadowHours:
 
 
 def shadow_hours(rows: Iterable[StateHours], budget: float | None) -> dict[str, list[ShadowHours]]:
-    """Return hours and onsets of all recordings, and by site, day, state of the sensors and why unheard.
+    """Return hours and onsets of all recordings, and by site, day, state of the sensors and unusable reason.
 
     Examples
     --------
@@ -83,9 +83,9 @@ def _hours(name: str, count: list[int], budget: float | None) -> ShadowHours:
 
 
 def hours_to_prove(onsets: int, hours: float, budget: float) -> float | None:
-    r"""Return how many more hours put the exact 95 % interval of the rate below a budget; None if none do.
+    r"""Return the further hours until the exact 95 % interval of the rate is below a budget; None if never.
 
-    Onsets go on at the rate r seen so far: the least T with
+    If onsets continue at the observed rate r, the total time is the least T with
 
     .. math:: \chi^2_{0.975}(2 r T + 2) / 2T \le b
 
@@ -111,7 +111,7 @@ _HEADS = "", "h heard", "h unheard", "onsets", "per h", "from", "to", "more h"
 
 
 def write_shadow_page(path: Path, week: Mapping[str, list[ShadowHours]], title: str) -> None:
-    """Write one page of HTML for a browser, without another file or a network."""
+    """Write a self-contained HTML page for a browser."""
     tables = []
     for group, rows in week.items():
         heads = "".join(f"<th>{escape(one or group)}</th>" for one in _HEADS)
