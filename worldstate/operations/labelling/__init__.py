@@ -1,1 +1,1 @@
-"""Labels from smoothed passes: places while only heard, and the time of line of sight."""
+"""Labels from smoothed passes: positions before a vehicle is visible, and the time of line of sight."""

@@ -1,4 +1,4 @@
-"""Files of labels: trajectories in the layout of ASAM OpenLABEL, windows as `train --labels` reads them."""
+"""Files of labels: trajectories in the layout of ASAM OpenLABEL, and windows for `--labels`."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -25,20 +25,20 @@ from worldstate.smoothing.observations import FirstSight
 
 from .pass_labels import PassLabel
 
-# Of windows, as `model features --labels` and `model fit --labels` read them.
+# Columns of windows for `model features --labels` and `model fit --labels`.
 COLUMNS = ("ID", "Class", "Environment", "Recording ID", "File", "End", "T0", "T0 std")
-# A window a second before T0 that is half a second off holds what the next class sounds like.
+# A window around T0 that is off by half a second contains sound of the next class.
 SUREST_STD_S = 0.3
-# Of a hand-over for T0: 0.16 s late in the demo, an image and a hop.
+# Error of a hand-over as T0: in the demo it is 0.16 s late, an image and a hop.
 HANDED_OVER_STD_S = 0.2
-_NO_FILES = {LOG_SUFFIX, *STORAGE_SUFFIXES}  # Logs hold no sound, and `model features` reads no bags
-_LOOKED = 0.9  # Share of the hops of a recording: without a camera no window is known to be one of nothing
-# As in streams: no vehicle comes for so long, and what was in view is gone for a second.
+_NO_FILES = {LOG_SUFFIX, *STORAGE_SUFFIXES}  # Logs have no sound, and `model features` cannot read bags
+_LOOKED = 0.9  # Least share of hops with a look of a camera, without which no window is known to be empty
+# As in streams: no vehicle comes within the first time, and a vehicle has left the view for the second.
 CALM_S, GONE_S, NONE_EVERY_S, TOGETHER_S = 5.0, 2.0, 10.0, 2.5
 
 
 def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
-    """Return the passes as an OpenLABEL document: objects with T0, a frame every tenth of a second."""
+    """Return the passes as an OpenLABEL document: objects with T0, and a frame every 0.1 s."""
     objects, frames = {}, dict[str, dict[str, Any]]()
     smoother = next((one.track.smoother for one in passes), "fixed-lag smoother")
     for number, one in enumerate(passes):
@@ -72,14 +72,14 @@ def open_label(recording: str, passes: Sequence[PassLabel]) -> dict[str, Any]:
 
 
 class SeenPass(NamedTuple):
-    """A vehicle that came into view out of an arm."""
+    """A vehicle that came into view from an arm."""
 
     arm: str
     t0: FirstSight
 
 
 def corpus_windows(corpus: Path) -> Iterator[tuple[object, ...]]:
-    """Yield the windows of a corpus, of recordings in which a camera looked, by when it saw vehicles."""
+    """Yield windows from the vehicles that cameras saw in a corpus; recordings without looks are skipped."""
     seen = defaultdict[str, list[HeardApproach]](list)
     for row in corpus_rows(corpus, HeardApproach):
         seen[row.recording] += [row] if row.seen else []
@@ -106,19 +106,19 @@ def window_rows(
     environment: str,
     file: str,
 ) -> list[tuple[object, ...]]:
-    """Return the windows of one recording: of every arm at T0, in view after it, and where no vehicle comes.
+    """Return the windows of one recording: one per pass at T0, one in view after it, and empty ones.
 
     Shapes: in_view (n,), of the times, time_s (n,).
     """
     rows: list[tuple[object, ...]] = []
 
     def add(label: str, number: str, unit: str, end_s: float, *entry: object) -> None:
-        """Add a window; of those without a vehicle the number is a time."""
+        """Add a window; for one without a vehicle the number is a time."""
         recording = f"{file}:{number}{unit}"
         rows.append((f"{number}{label}", label, environment, recording, file, round(end_s, 2), *entry))
 
     sure = [one for one in passes if one.t0.std_s <= SUREST_STD_S]
-    # One recording a pass: what is split must not share a vehicle.
+    # Each pass is a recording of its own, because data sets are split by recording.
     for number, one in enumerate(sure):
         near = [abs(one.t0.time_s - two.t0.time_s) for two in passes if two is not one]
         if min(near, default=np.inf) < TOGETHER_S:
@@ -132,7 +132,7 @@ def window_rows(
     last = -np.inf
     for end_s in time_s.tolist():
         coming = ((entries >= end_s - 1.0) & (entries <= end_s + CALM_S)).any()
-        # A vehicle about to be seen may be heard already, even where no pass was made of it.
+        # The sound of a vehicle may precede its detection, even without a pass.
         busy = in_view[(time_s > end_s - 1.0 - GONE_S) & (time_s <= end_s + CALM_S)].any()
         if end_s - last >= NONE_EVERY_S and end_s <= time_s[-1] - CALM_S and not (coming or busy):
             add("none", f"{end_s:.0f}", "s", end_s, "", "")
@@ -141,17 +141,17 @@ def window_rows(
 
 
 def file_below(sound: Path, labels: Path) -> str:
-    """Return the path of a recording as a list of labels names it, relative to its own folder.
+    """Return the path of a recording relative to the folder of its list of labels.
 
     Raises
     ------
     InputFileError
-        If the recording does not lie there or below.
+        If the recording is not in this folder or below.
     """
     try:
         return sound.resolve().relative_to(labels.resolve().parent).as_posix()
     except ValueError as error:
-        problem = f"expected it in the folder of {sound.name} or above, where readers of the list find that"
+        problem = f"expected it in the folder of {sound.name} or above, from where its path is relative"
         raise InputFileError(labels, problem) from error
 
 

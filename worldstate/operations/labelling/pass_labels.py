@@ -1,6 +1,6 @@
-"""Join the boxes of a standing camera into passes, and smooth every pass: where it was hidden, and its T0.
+"""Linking of a standing camera's boxes to passes, and smoothing of each pass with its hidden part and T0.
 
-A track is one vehicle, by its leading and trailing edge.
+A track is one vehicle, given by its leading and trailing edge.
 """
 
 import math
@@ -28,35 +28,35 @@ from worldstate.smoothing.observations import (
 )
 from worldstate.state.context import blind_corner
 
-# A vehicle three metres ahead at 10 m/s turns by a fifth of a radian from image to image; boxes of two
-# vehicles in view at once lie farther apart than their own width most of the time.
+# A vehicle 3 m ahead at 10 m/s turns by 0.2 rad between images; boxes of two vehicles in view are mostly
+# farther apart than their own width.
 _GATE_RAD = math.radians(8.0)
-LONGEST_GAP_S = 0.8  # Eight images: of 86 % detected each, one gap in ten million is longer
+LONGEST_GAP_S = 0.8  # Eight images: if each is detected with 86 %, one gap in ten million is longer
 _LEAST_BOXES = 4
-# A vehicle that turns less than this while in view drives along the ego's own street and comes from no arm.
+# A vehicle in view that turns less than this drives along the ego's street and comes from no arm.
 _LEAST_TURN_RAD = math.radians(8.0)
-# A crossing vehicle keeps its distance ahead. From the first quarter of the boxes to the last, those of 519
-# of 520 simulated passes shrink to .966 or less far, those of 47 cars that overtook to .914 or farther: these
-# come into view beside the ego, and were taken for passes out of the left arm. At drawn junctions that were
-# not looked at for this, 8 of 2158 passes are lost, and 5 of 88 cars stay.
+# A crossing vehicle keeps its distance ahead. From the first quarter of its boxes to the last, the height
+# ratio is at least 0.966 for 519 of 520 simulated passes, and at most 0.914 for 47 overtaking cars, which
+# come into view beside the ego and were taken for passes from the left arm. At independent random junctions 8
+# of 2158 passes are lost, and 5 of 88 cars remain.
 _LEAST_GROWTH = 0.94
-# Nearer to the edge of the image than this a box ends with the image, not with the vehicle.
+# Closer to the border than this, a box ends at the image and not at the vehicle.
 _BORDER_PX = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxTrack:
-    """The boxes of one vehicle, image by image."""
+    """The boxes of one vehicle in successive images."""
 
     time_s: FloatArray  # shape (n,)
-    left_rad: FloatArray  # shape (n,): Azimuth of the box's left edge, NaN where the image cuts it
+    left_rad: FloatArray  # shape (n,): Azimuth of the box's left edge; NaN if the image border cuts it
     right_rad: FloatArray  # shape (n,)
-    height_rad: FloatArray  # shape (n,): Over the depth of its near side; NaN where the image cuts it
+    height_rad: FloatArray  # shape (n,): Height over depth of its near side; NaN if the image border cuts it
     label: str
 
     @property
     def arm(self) -> str | None:
-        """Side that it came from, None where it drives along the ego's street or away from the ego."""
+        """Side from which it came; None if it drives along the ego's street or away from the ego."""
         middle = 0.5 * (self.left_rad + self.right_rad)
         middle = middle[np.isfinite(middle)]
         if middle.size < _LEAST_BOXES or abs(middle[-1] - middle[0]) < _LEAST_TURN_RAD or self._recedes:
@@ -78,13 +78,13 @@ class BoxTrack:
 
     @property
     def edge_rad(self) -> float:
-        """Azimuth of the occluder's edge: where its boxes ended on the side that it came from, at first."""
+        """Azimuth of the occluder's edge: the trailing edge of the first box."""
         trailing = self.left_rad if self.arm == "left" else self.right_rad
         return float(trailing[0])
 
 
 def box_tracks(log: DetectionLog, camera: PinholeCamera, keep: DetectionFilter) -> list[BoxTrack]:
-    """Return the passes of all vehicles that move, in the order of their first boxes."""
+    """Return the passes of all moving vehicles in the order of their first boxes."""
     joined = linked_boxes(_moving_boxes(log, camera, keep), _GATE_RAD, LONGEST_GAP_S)
     every = [one for one in joined if len(one) >= _LEAST_BOXES]
     return sorted(map(_track, every), key=lambda one: float(one.time_s[0]))
@@ -116,9 +116,9 @@ def _track(boxes: list[AzimuthBox]) -> BoxTrack:
     return BoxTrack(**columns, label=Counter(box.label for box in boxes).most_common(1)[0][0])
 
 
-# A vehicle is heard for some three seconds; longer ago the motion since T0 says nothing of the place.
+# A vehicle is audible for about 3 s; the motion after T0 does not determine much earlier positions.
 HIDDEN_S, HOP_S = 5.0, 0.1
-# Height and width of the body by the detector's classes, m, and how widely the height varies, relative.
+# Height and width of the body by class of the detector, m, and relative spread of the height.
 _BODIES = {
     "car": (1.55, 1.8, 0.1),
     "truck": (2.9, 2.4, 0.25),
@@ -126,41 +126,41 @@ _BODIES = {
     "train": (3.6, 2.5, 0.1),
 }
 _OTHER_BODY = (1.7, 0.7, 0.1)
-# Three pixels of an image that is 69 degrees wide, and what a detector adds at a body's rounded corners.
+# Three pixels of a 69 degree wide image, and the detector's error at rounded corners of a body.
 _BOX_STD_RAD, _HEIGHT_STD = math.radians(0.4), 0.05
 _LEAST_EDGE_STD_RAD = math.radians(0.5)
-# In the two seconds before T0 simulated drivers depart from the pace that they have then as under white
-# acceleration of .015 to .04 m^2/s^3 in the median, .04 to .26 in the mean square; with 1 m^2/s^3 and a scale
-# of 1 the stated variance of hidden places was four times the squared error. In the grid of densities and
-# scales of lab/NOTES.md these have one of the least errors, and state it rightly.
+# In the 2 s before T0, simulated drivers deviate from their pace at T0 like white acceleration of 0.015 to
+# 0.04 m^2/s^3 in the median and 0.04 to 0.26 in the mean square. With 1 m^2/s^3 and a scale of 1 the stated
+# variance of hidden positions was four times the squared error. In a grid of densities and scales
+# (lab/NOTES.md) the values here have one of the least errors with a correct variance.
 _ACCELERATION_PSD, _MANOEUVRE_K = 0.03, 1.2
-# Longer than a pass; solved once, at its end: with nothing seen yet, relinearised on the way, the range
-# runs off and the system is indeterminate.
+# Longer than a pass, which is solved once at its end. If it is relinearised before the first box, the range
+# diverges and the system is indeterminate.
 _SMOOTHING = SmoothingSettings(
     lag_s=30.0, relinearize_every=1000, acceleration_psd=_ACCELERATION_PSD, manoeuvre_k=_MANOEUVRE_K
 )
-# At the earliest hop: beyond the corner, at a walk to 15 m/s, from some 10 to 100 m away.
+# At the earliest hop: behind the corner, at walking pace to 15 m/s, about 10 to 100 m away.
 _START_STD = (math.radians(25.0), 0.25, 0.3, 0.6)
 _START_RAD, _START_M = math.radians(55.0), 30.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassLabel:
-    """One vehicle that came out of a hidden arm."""
+    """One vehicle that came from a hidden arm."""
 
     arm: str
     label: str
     t0: FirstSight
     track: SmoothedTrack  # From some seconds before T0 until it was last seen
-    edge_rad: float = math.nan  # Azimuth of its corner by its own first box; NaN where the image cuts that
+    edge_rad: float = math.nan  # Azimuth of its corner from its first box; NaN if the image border cuts it
 
 
 def label_passes(
     tracks: Sequence[BoxTrack], camera_ahead_m: float = 0.0, on_pass: Callable[[], None] = lambda: None
 ) -> list[PassLabel]:
-    """Return the labels of all vehicles that came out of an arm, in the order of their boxes.
+    """Return the labels of all vehicles that came from an arm, in the order of their boxes.
 
-    By the factor graph; where gtsam is not installed, by the RTS smoother of filterpy.
+    They are smoothed by the factor graph, or without gtsam by the RTS smoother of filterpy.
     """
     if not has_extra("gtsam"):
         check_extra("filterpy")
@@ -175,15 +175,16 @@ def label_passes(
 
 
 def _edge(tracks: Sequence[BoxTrack], arm: str) -> tuple[float, float]:
-    """Return azimuth and deviation of an arm's edge: the median of where its vehicles came out."""
+    """Return azimuth and standard deviation of an arm's edge: the median over its vehicles."""
     seen = np.array([one.edge_rad for one in tracks if one.arm == arm])
     seen = seen[np.isfinite(seen)]
     if not seen.size:
-        # Cut by the edge of the image: the corner of a usual junction, so that T0 is stated widely.
+        # The image border cuts all boxes. The corner of a usual junction gives T0 a large standard deviation.
         usual = blind_corner(arm, 1 if arm == "left" else -1)
         return usual.edge_azimuth_rad, usual.edge_std_rad
     middle = float(np.median(seen))
-    # 1.48 makes the median deviation that of a Gaussian; a single pass tells the edge as well as its box.
+    # The factor 1.48 converts the median deviation to that of a Gaussian; a single pass is as accurate as its
+    # box.
     spread = 1.48 * float(np.median(np.abs(seen - middle))) / math.sqrt(seen.size)
     return middle, max(spread, _LEAST_EDGE_STD_RAD)
 
@@ -194,7 +195,7 @@ def _smoothed(
     observed = _observations(one, camera_ahead_m)
     stamped = {nanoseconds(at * HOP_S): observed[at] for at in sorted(observed)}
     arm, side = one.arm or "", 1 if one.arm == "left" else -1
-    # What is believed of a vehicle some seconds before it comes into view.
+    # Prior of a vehicle some seconds before it comes into view.
     start = MotionBelief.around((side * _START_RAD, -side * 0.1, -0.15, math.log(_START_M)), _START_STD)
     smooth = _graph_track if has_extra("gtsam") else rts_track
     track = smooth(name, start, stamped)
@@ -213,10 +214,11 @@ def _graph_track(
 
 
 def _observations(one: BoxTrack, camera_ahead_m: float) -> dict[int, list[Observation]]:
-    """Return what is observed of a vehicle every tenth of a second: nothing before its boxes, then these."""
-    # Approach rates of the hidden phase are left out: a source that nears its corner grows louder out of the
-    # shadow, too, which of trucks said 1.0 1/s in place of .45, to a stated .12. With 0.3 1/s added to their
-    # deviation hidden places two seconds before T0 were off by 1.8 m in the median, without them by 1.1 m.
+    """Return the observations of a vehicle every 0.1 s: none before its boxes, then the boxes."""
+    # Approach rates of the hidden phase are not used, because the level of a source near its corner also
+    # rises as it leaves the shadow: trucks had 1.0 1/s instead of 0.45, with a stated deviation of 0.12. With
+    # 0.3 1/s added to the deviation, the median error of hidden positions 2 s before T0 was 1.8 m, and
+    # without these rates 1.1 m.
     first = round(float(one.time_s[0]) / HOP_S)
     found: dict[int, list[Observation]] = {at: [] for at in range(first - round(HIDDEN_S / HOP_S), first)}
     for time_s, azimuth, height in zip(one.time_s, one.leading_rad, one.height_rad, strict=True):
@@ -226,11 +228,12 @@ def _observations(one: BoxTrack, camera_ahead_m: float) -> dict[int, list[Observ
 
 
 def _seen(azimuth_rad: float, height: float, label: str, camera_ahead_m: float) -> list[Observation]:
-    """Return what a box says of the middle of a vehicle's front."""
+    """Return the observations that a box gives of the middle of a vehicle's front."""
     if not (math.isfinite(azimuth_rad) and math.isfinite(height)):
         return []
     true_m, width_m, spread = _BODIES.get(label, _OTHER_BODY)
-    # The box is as high as the near side, and its leading edge that of the far one: half a body's width each.
+    # The box has the height of the near side, and its leading edge is that of the far side: half a width
+    # each.
     ahead_m = true_m / height + camera_ahead_m + 0.5 * width_m
     aside_m = (ahead_m + 0.5 * width_m) * math.tan(azimuth_rad)
     range_m = math.hypot(ahead_m, aside_m)

@@ -1,4 +1,4 @@
-"""Bird's-eye of a street as it was learned, and of the passes of a recording with their smoothed tracks."""
+"""Bird's-eye view of a learned street, and of the passes of a recording with their smoothed tracks."""
 
 import math
 from collections.abc import Sequence
@@ -21,22 +21,22 @@ from .street_passes import street_pass
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Bearings hold no metres: places are drawn on a lane this far ahead, where that of OVAD's junctions lies.
+# Bearings have no range, so positions are drawn on a lane at this distance ahead, as at OVAD's junctions.
 _LANE_M = 9.0
-_BEFORE_S, _APART_M = (1.0, 2.0, 3.0), 1.3  # Rows of the drawing, so that their bars do not hide one another
+_BEFORE_S, _APART_M = (1.0, 2.0, 3.0), 1.3  # Rows of the drawing, far enough apart to show all bars
 _WIDEST_M, _COLUMNS = 26.0, 2
-_EVERY = 5  # Half a second apart, they can still be told from one another
+_EVERY = 5  # Ellipses half a second apart can be distinguished
 _FARTHEST_M = 40.0
 _DASHES = dict(zip(("left", "right"), SIDE_DASHES, strict=False))
-_EDGE = "0.35"  # Of what hides: no vehicle, so no colour
-_SAME_PASS_S = 2.0  # Of T0: vehicles nearer to one another are mostly not seen apart
+_EDGE = "0.35"  # Occluders are no vehicles, so they are grey
+_SAME_PASS_S = 2.0  # Difference of T0; closer vehicles are mostly not resolved
 
 
 def write_street_figure(stages: Sequence[tuple[str, LearnedStreet]], path: Path) -> None:
-    """Draw a street at some stages side by side, the ego at the origin and looking up.
+    """Draw a street at several stages side by side, with the ego at the origin, ahead at the top.
 
-    Filled is where the edge is believed, two deviations either way; the dots of a row are the median driver
-    1, 2 or 3 s before line of sight, bars one deviation of pace.
+    The edge is filled up to two standard deviations on either side. The dots of a row show the median driver
+    1, 2 or 3 s before line of sight; bars show one standard deviation of pace.
     """
     columns = min(len(stages), _COLUMNS)
     rows = math.ceil(len(stages) / columns)
@@ -54,7 +54,7 @@ def write_street_figure(stages: Sequence[tuple[str, LearnedStreet]], path: Path)
 
 
 def draw_edge(axes: "Axes", one: Occluder) -> None:
-    """Draw the line of sight past an edge as it is believed, two deviations either way."""
+    """Draw the line of sight past an edge, with two standard deviations on either side."""
     low, high = (_aside_m(one.edge_azimuth_rad + k * one.edge_std_rad) for k in (-2.0, 2.0))
     axes.fill([0.0, low, high], [0.0, _LANE_M, _LANE_M], color=_EDGE, alpha=0.25, linewidth=0.0)
     axes.plot([0.0, _aside_m(one.edge_azimuth_rad)], [0.0, _LANE_M], color=_EDGE, label="edge, as learned")
@@ -75,7 +75,7 @@ def _aside_m(azimuth_rad: float) -> float:
 
 
 def _place_m(one: Occluder, factor: float, time_s: float) -> float:
-    """Return where a vehicle is so long before line of sight, metres to the left on the drawn lane."""
+    """Return a vehicle's position at a time before line of sight, metres to the left on the drawn lane."""
     slope = math.tan(abs(one.edge_azimuth_rad)) + factor * one.pace_hz * time_s
     return math.copysign(_LANE_M * slope, one.edge_azimuth_rad)
 
@@ -83,7 +83,7 @@ def _place_m(one: Occluder, factor: float, time_s: float) -> float:
 def write_pass_figure(
     passes: Sequence[PassLabel], path: Path, title: str, truth: Sequence[TrueTrack] = ()
 ) -> None:
-    """Draw every pass seen from above, the ego at the origin and looking up."""
+    """Draw every pass from above, with the ego at the origin, ahead at the top."""
     with figure_file(path, 8.5, 2.8) as figure:
         axes = figure.add_subplot(title=title)
         draw_passes(axes, passes, truth)
@@ -91,10 +91,10 @@ def write_pass_figure(
 
 
 def draw_passes(axes: "Axes", passes: Sequence[PassLabel], truth: Sequence[TrueTrack] = ()) -> None:
-    """Draw smoothed tracks, the edges that these passes tell, and the true tracks of the same vehicles."""
+    """Draw smoothed tracks, the edges learned from these passes, and the true tracks of the same vehicles."""
     street = reduce(with_pass, map(street_pass, passes), LearnedStreet())
     for occluder in context_of(street).occluders:
-        # Of an arm that no vehicle came out of, nothing is known.
+        # An arm without a pass is unknown.
         if not occluder.assumed:
             draw_edge(axes, occluder)
     for one in passes:
@@ -107,11 +107,11 @@ def draw_passes(axes: "Axes", passes: Sequence[PassLabel], truth: Sequence[TrueT
 
 
 def draw_track(axes: "Axes", track: SmoothedTrack, hidden: BoolArray, dashes: str, label: str) -> None:
-    """Draw a track with an ellipse of two deviations every half second, by where it was hidden."""
+    """Draw a track with an ellipse of two deviations every half second, coloured as hidden or in view."""
     from matplotlib.patches import Ellipse
 
     states = track.states
-    # The first state in view ends the hidden part, too: it is one vehicle.
+    # The hidden part includes the first state in view, so that the track is connected.
     unseen = hidden | np.roll(hidden, 1)
     for part, color, shown in ((unseen, HIDDEN, "hidden"), (~hidden, IN_VIEW, "in view")):
         axes.plot(*states[part, 1::-1].T, dashes, color=color, label=f"{label}, {shown}")
@@ -120,7 +120,7 @@ def draw_track(axes: "Axes", track: SmoothedTrack, hidden: BoolArray, dashes: st
         color = HIDDEN if was_hidden else IN_VIEW
         lengths, axis = np.linalg.eigh(spread[:2, :2])
         angle = np.degrees(np.arctan2(axis[0, 1], axis[1, 1]))
-        # Four deviations from end to end hold .86 of a Gaussian of two dimensions.
+        # An ellipse of two deviations contains 86 % of a two-dimensional Gaussian.
         sides = 4.0 * np.sqrt(lengths[::-1])
         axes.add_patch(Ellipse((place[1], place[0]), *sides, angle=angle, fill=False, color=color, alpha=0.3))
 

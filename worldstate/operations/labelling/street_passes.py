@@ -1,4 +1,4 @@
-"""What the passes of a recording tell of its street, and what was heard of it meanwhile."""
+"""Learning of a street from the passes of a recording and from the sound before them."""
 
 import logging
 import math
@@ -27,11 +27,11 @@ from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watch
 
 from .pass_labels import PassLabel, box_tracks, label_passes
 
-# No vehicle comes out of an arm nearer to the axis: one that turns there has overtaken, or was two.
+# No vehicle comes from an arm closer to the axis: such a track is an overtaking vehicle, or two vehicles.
 _LEAST_EDGE_RAD = math.radians(5.0)
-# Slower ones turn off or park behind the corner, faster ones were two vehicles.
+# Slower vehicles turn off or park behind the corner; faster tracks are two vehicles.
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 3.0
-# Before T0; a vehicle is heard for some three seconds.
+# Time before T0 in which a vehicle is audible.
 _HEARD_S = 3.0
 
 _UNHEARD = "what the arms sound like is not learned: %s"
@@ -39,10 +39,10 @@ _LOG = logging.getLogger(__name__)
 
 
 def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
-    """Return what a labelled pass tells of its arm: edge, pace, and the sound before."""
+    """Return what a labelled pass contributes to its arm: edge, pace, and the sound before."""
     x, y, vx, vy = (float(np.interp(one.t0.time_s, one.track.time_s, row)) for row in one.track.states.T)
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
-    # A first box may show no edge of this arm.
+    # The first box may not be at the edge of this arm.
     outwards_rad = one.edge_rad if one.arm == "left" else -one.edge_rad
     edge_rad = one.edge_rad if outwards_rad >= _LEAST_EDGE_RAD else None
     usual_hz = pace_hz if _SLOWEST_HZ <= pace_hz <= _FASTEST_HZ else None
@@ -51,15 +51,15 @@ def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeardStreet:
-    """How sound arrived at every hop, and how likely a vehicle was coming."""
+    """Arrival pattern of the sound at every hop, and the probability that a vehicle was coming."""
 
     time_s: FloatArray  # shape (n,)
-    patterns: FloatArray  # shape (n, 12), as `arrival_pattern`
+    patterns: FloatArray  # shape (n, 12), from `arrival_pattern`
     coming: FloatArray  # shape (n,)
     heard_by: str
 
     def before(self, one: PassLabel, every: Sequence[PassLabel]) -> PassSound | None:
-        """Return how a pass sounded while it was hidden; None where another one came out of the other arm."""
+        """Return the sound of a pass while it was hidden; None if another one came from the other arm."""
         t0_s = one.t0.time_s
         if any(other.arm != one.arm and abs(other.t0.time_s - t0_s) < _HEARD_S for other in every):
             return None
@@ -71,22 +71,22 @@ class HeardStreet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchedRecording:
-    """What a camera saw of a street in one recording, and what was heard."""
+    """Passes of a street in one recording, and its sound."""
 
     passes: Sequence[PassLabel]
     duration_s: float
-    heard: HeardStreet | None = None  # Meanwhile, where there is sound
+    heard: HeardStreet | None = None  # Sound of the same time, if available
 
 
 def watched_recording(
     log: DetectionLog, camera: PinholeCamera, keep: DetectionFilter, duration_s: float
 ) -> WatchedRecording:
-    """Return the passes of a recording, smoothed."""
+    """Return the smoothed passes of a recording."""
     return WatchedRecording(label_passes(box_tracks(log, camera, keep), camera.position_m[0]), duration_s)
 
 
 def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterator[LearnedStreet]:
-    """Yield a street after every pass of a recording, and once more with all that the recording tells."""
+    """Yield a street after every pass of a recording, and once more at the end of the recording."""
     before_s = 0.0
     for one in sorted(recording.passes, key=lambda one: one.t0.time_s):
         now_s = min(max(one.t0.time_s, before_s), recording.duration_s)
@@ -98,9 +98,9 @@ def streets_after(street: LearnedStreet, recording: WatchedRecording) -> Iterato
 
 
 def heard_street(source: Source, model: Model) -> HeardStreet | None:
-    """Listen to a whole recording with a model; None, and a warning why, where it was not made for the sound.
+    """Apply a model to a whole recording; return None with a warning if the sound is outside its domain.
 
-    Hops without a sequence's reading are left out.
+    Hops without a result of the sequence are skipped.
     """
     try:
         listened = open_source(source.sound, array=source.array, model=model)
@@ -125,22 +125,21 @@ def heard_street(source: Source, model: Model) -> HeardStreet | None:
 
 
 def write_street(path: str | Path, street: LearnedStreet) -> None:
-    """Write a street to exactly this path, whole or not at all."""
+    """Write a street to a file, atomically."""
     write_json(path, encode(street))
 
 
 def read_street(path: str | Path) -> LearnedStreet:
-    """Read what `write_street` wrote.
+    """Read a file written by `write_street`.
 
-    Files of worldstate 0.2 also hold rates of reveal and departure, which brought nothing: a warning says
-    that they are left out.
+    Files of worldstate 0.2 also contain rates of reveal and departure, which are ignored with a warning.
 
     Raises
     ------
     InputFileError
-        If the file is missing, no JSON, or a value is missing or out of range.
+        If the file is missing or not JSON, or a value is missing or out of range.
     SchemaVersionError
-        If it is of another major version, or no street.
+        If the file has another major version, or is not a street.
     """
     with refused_as_file(path):
         told: Any = read_json(path, "a learned street file")
