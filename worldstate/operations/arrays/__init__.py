@@ -1,1 +1,1 @@
-"""What an array allows, how near the estimators come to it, and what they cost."""
+"""Theoretical limits of an array, the accuracy of the estimators, and their cost."""

@@ -1,4 +1,4 @@
-"""Bounds that follow from the microphone positions: moment, aperture, alias frequency, bearing bound."""
+"""Bounds from the microphone positions: moment, aperture, alias frequency and bearing bound."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.bounds import cramer_rao
 
-# Samples of one second; the bound depends on the duration and SNR times the number of samples only.
+# Sample rate of a one-second tone; the bound depends only on the duration and on SNR times number of samples.
 TONE_RATE_HZ = 48_000.0
 
 
@@ -25,16 +25,16 @@ class ArrayBounds:
     aperture_m : tuple of float
         Extent along x, y and z, metres.
     mean_spacing_m, alias_hz : float
-        Mean distance to the nearest neighbour, and the frequency c / (2 d) that goes with it.
+        Mean distance d to the nearest neighbour, and the alias frequency c / (2 d).
     ambiguity : str
-        What the array cannot tell apart: see `MicrophoneArray.ambiguity`.
+        Azimuths that the array cannot distinguish: see `MicrophoneArray.ambiguity`.
     broadside_deg : float
-        Azimuth at which it tells bearings best, degrees.
+        Azimuth with the smallest bearing bound, degrees.
     frequency_hz : float
-        What the bounds hold for.
+        Frequency of the bounds.
     sigma_deg : dict of float to (float or None)
-        By azimuth in degrees: smallest standard deviation of a bearing times sqrt(2 N SNR), degrees; None
-        where the array hears no azimuth at all.
+        By azimuth in degrees: smallest standard deviation of a bearing times sqrt(2 N SNR), degrees; None if
+        the array cannot estimate the azimuth.
 
     Examples
     --------
@@ -54,12 +54,12 @@ class ArrayBounds:
     sigma_deg: dict[float, float | None]
 
     def at(self, azimuth_deg: float, snr_db: float, snapshots: int) -> float | None:
-        """Return the smallest standard deviation of a bearing, degrees; None where there is none.
+        """Return the smallest standard deviation of a bearing, degrees; None if there is no bound.
 
         Parameters
         ----------
         azimuth_deg : float
-            One of those asked for.
+            One of the azimuths of `sigma_deg`.
         snr_db : float
             Per microphone and snapshot, dB.
         snapshots : int
@@ -68,7 +68,7 @@ class ArrayBounds:
         Returns
         -------
         float or None
-            A standard deviation.
+            The standard deviation in degrees.
 
         Examples
         --------
@@ -81,17 +81,17 @@ class ArrayBounds:
         return None if constant is None else constant / float(np.sqrt(2.0 * snapshots * snr))
 
     def radial_speed_std_m_s(self, snr_db: float) -> float:
-        """Return the bound of a radial speed from one second of a tone at `frequency_hz`, at one microphone.
+        """Return the bound of a radial speed from one second of a tone, with one microphone.
 
         Parameters
         ----------
         snr_db : float
-            Of the tone's samples, dB.
+            SNR of the tone's samples, dB.
 
         Returns
         -------
         float
-            A standard deviation, m/s, where the frequency at rest is known.
+            A standard deviation, m/s, for a known frequency at rest.
 
         Examples
         --------
@@ -103,12 +103,12 @@ class ArrayBounds:
         return float(np.sqrt(cramer_rao.radial_speed_crb_m2_s2(variance, self.frequency_hz)))
 
     def to_dict(self) -> dict[str, object]:
-        """Return the same as JSON-able values, azimuths as text.
+        """Return the fields as values for JSON, with azimuths as text.
 
         Returns
         -------
         dict
-            One entry a field.
+            One entry per field.
 
         Examples
         --------
@@ -120,21 +120,21 @@ class ArrayBounds:
 
 
 def array_bounds(array: MicrophoneArray, frequency_hz: float, azimuths_deg: Sequence[float]) -> ArrayBounds:
-    """Say what an array allows at a frequency.
+    """Compute the bounds of an array at a frequency.
 
     Parameters
     ----------
     array : MicrophoneArray
         Microphones.
     frequency_hz : float
-        Of a far-field source.
+        Frequency of a far-field source.
     azimuths_deg : sequence of float
-        Where it stands, left positive, degrees.
+        Azimuths of the source, left positive, degrees.
 
     Returns
     -------
     ArrayBounds
-        For elevation zero.
+        The bounds for elevation zero.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def array_bounds(array: MicrophoneArray, frequency_hz: float, azimuths_deg: Sequ
 
 
 def _constant_deg(array: MicrophoneArray, frequency_hz: float, azimuth_deg: float) -> float | None:
-    """Bound at 2 N SNR = 1; a million degrees is a division by nothing."""
+    """Return the bound for 2 N SNR = 1; a value of a million degrees is a division by zero."""
     variance = cramer_rao.bearing_crb_rad2(array.positions_m, np.radians(azimuth_deg), frequency_hz, 0.5, 1)
     sigma = float(np.degrees(np.sqrt(variance)))
     return sigma if sigma < 1e6 else None
