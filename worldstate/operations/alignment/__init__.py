@@ -1,1 +1,1 @@
-"""How a camera stands to the array, in time and in yaw, from vehicles that both noticed."""
+"""Offset between a camera and an array in time and yaw, from vehicles that both detected."""

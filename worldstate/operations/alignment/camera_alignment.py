@@ -1,13 +1,13 @@
-r"""Offset of a camera's clock and its yaw against the array, by the bearings of vehicles in view.
+r"""Offset of a camera's clock and yaw against the array, from the bearings of vehicles in view.
 
-A bearing of the sound is that of the vehicle in view, with a normal error, or of something else, at any
-azimuth. With the place in the boxes that is heard, b(t), offset d and yaw y,
+A bearing of the sound is either that of the vehicle in view, with a normal error, or that of another source,
+at a uniform azimuth. With the position b(t) of the sound source in the boxes, offset d and yaw y,
 
 .. math:: L(d, y) = \sum_i \log\Big(\epsilon + (1 - \epsilon)\, \pi\,
-          N\big(\theta_i; b(t_i - d) + y, \sigma^2\big)\Big)
+      N\big(\theta_i; b(t_i - d) + y, \sigma^2\big)\Big)
 
-to which a bearing adds nothing where no box was seen at its time. It is read on a grid, so that no start has
-to be near.
+to which a bearing adds nothing if there is no box at its time. L is computed on a grid, so that no initial
+value is needed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,55 +26,55 @@ from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks
 from worldstate.operations.recordings.bearing_track import track_bearings
 from worldstate.operations.recordings.hop_table import HopTable
 
-# What is looked for: clocks that were started by hand, brackets that were put on by eye.
+# Search range: clocks started by hand, and brackets mounted by eye.
 LARGEST_OFFSET_S, LARGEST_YAW_DEG = 1.0, 15.0
 _OFFSET_STEP_S, _YAW_STEP_DEG = 0.01, 0.25
 _OFFSETS_S, _YAWS_DEG = (
     step * np.arange(-round(largest / step), round(largest / step) + 1)
     for largest, step in ((LARGEST_OFFSET_S, _OFFSET_STEP_S), (LARGEST_YAW_DEG, _YAW_STEP_DEG))
 )
-# Error of a bearing of a vehicle in view: the published median of 3.4 degrees, and what a box adds.
+# Error of a bearing of a vehicle in view: the published median of 3.4 degrees, and the error of a box.
 _STD_RAD = np.radians(4.0)
-# Share of bearings that are of something else: at busy junctions every second one.
+# Share of bearings of other sources: one half at busy junctions.
 _OTHER = 0.5
-# Error at which a bearing is as likely of the vehicle as of something else.
+# Error at which a bearing is equally likely to be of the vehicle or of another source.
 _OWN_RATIO = (1.0 - _OTHER) * np.pi / (_OTHER * _STD_RAD * np.sqrt(2.0 * np.pi))
 _OWN_RAD = _STD_RAD * np.sqrt(2.0 * np.log(_OWN_RATIO))
-# An interval over fewer passes would be that of one or two vehicles.
+# With fewer passes the interval would describe only one or two vehicles.
 FEWEST_PASSES = 5
 _FEWEST_A_SIDE = 2
 _DRAWS = 400
-# A bearing near the first or the last box counts less, over so many seconds: boxes and bearings come every
-# 0.1 s, and whole bearings that enter or leave would pull the offset to multiples of that.
+# Weights of bearings near the first or last box decrease over this time. Boxes and bearings have a period of
+# 0.1 s, so without weights the offset would tend to multiples of it.
 _TAPER_S = 0.2
-# By then most of a vehicle has left the corner, which cuts its box before.
+# After this time most of a vehicle has passed the corner, which cuts its earlier boxes.
 _WHOLE_AFTER_S = 0.5
-# Where in its box a vehicle is heard, from the leading edge to the trailing one: between the front axle, with
-# the engine, and the middle. On 38 simulated passes an alignment that is none comes out as none; a tenth of a
-# box more or less is 0.1 s of offset.
+# Position of the sound source in its box, from the leading edge to the trailing one: between the middle and
+# the front axle with the engine. On 38 simulated passes it gives a zero alignment if there is none; a tenth
+# of a box more or less is 0.1 s of offset.
 _HEARD_AT = 0.33
-# Shorter views say little of when and where at once.
+# Shorter views cannot separate offset and yaw.
 _SHORTEST_S = 0.5
-# Less certain is a bearing of a flat spectrum; what is of another sound is left to the fit.
+# Larger deviations come from flat spectra; the fit itself rejects bearings of other sources.
 _LARGEST_STD_DEG = 40.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeardPass:
-    """One vehicle: where in its boxes it is heard, and every bearing of the sound around that time."""
+    """One vehicle: position of the sound source in its boxes, and all bearings around that time."""
 
     box_time_s: FloatArray  # Shape (n,), increasing, on the clock of the images
-    box_rad: FloatArray  # Shape (n,): azimuth of that place
-    sound_time_s: FloatArray  # Shape (m,): when the sound left the vehicle, on the clock of the sound
+    box_rad: FloatArray  # Shape (n,): azimuth of the sound source in the box
+    sound_time_s: FloatArray  # Shape (m,): emission time of the sound, on the clock of the sound
     sound_rad: FloatArray  # Shape (m,)
 
 
 def heard_passes(source: Source, margin_s: float) -> list[HeardPass]:
-    """Return every vehicle that turned through the view, with the bearings `margin_s` before and after."""
+    """Return every vehicle that crossed the view, with the bearings from `margin_s` before to after."""
     if source.detections is None:
         return []
     bearings = _bearings(source)
-    # The sound that arrives now left the vehicle before.
+    # The bearing belongs to the time at which the vehicle emitted the sound.
     emitted_s = bearings.time_s - source.camera.nominal_range_m / SPEED_OF_SOUND_M_S
     usable = np.isfinite(bearings.azimuth_deg) & (bearings.std_deg < _LARGEST_STD_DEG)
     found = []
@@ -92,7 +92,7 @@ def _bearings(source: Source) -> HopTable:
 
 
 def _whole(tracks: list[BoxTrack]) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield times and azimuths at which vehicles are heard, where neither corner nor image cuts the box."""
+    """Yield times and azimuths of sound sources whose box is cut neither by the corner nor by the image."""
     for track in tracks:
         trailing_rad = track.left_rad + track.right_rad - track.leading_rad
         heard_rad = (1.0 - _HEARD_AT) * track.leading_rad + _HEARD_AT * trailing_rad
@@ -104,36 +104,36 @@ def _whole(tracks: list[BoxTrack]) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """What has to be added to a camera's stamps and yaw, each with its 95 % interval."""
+    """Corrections of a camera's stamps and yaw, each with its 95 % interval."""
 
-    offset_s: float  # To the stamps of its images, so that they are on the clock of the sound
+    offset_s: float  # Added to the stamps of its images, to obtain the clock of the sound
     offset_interval_s: tuple[float, float]
-    yaw_deg: float  # To its yaw, left positive
+    yaw_deg: float  # Added to its yaw, left positive
     yaw_interval_deg: tuple[float, float]
     passes: int  # Vehicles in view
-    bearings: int  # Bearings of the sound while one was in view
-    agreeing: float  # Share of those that are rather its own than something else's
-    median_error_deg: float  # Of these
+    bearings: int  # Number of bearings while a vehicle was in view
+    agreeing: float  # Share of these that are more likely of the vehicle than of another source
+    median_error_deg: float  # Median error of the agreeing ones
 
 
 def align(passes: Sequence[HeardPass]) -> Alignment:
-    """Return the alignment that most bearings agree with; the interval is a bootstrap over the passes.
+    """Return the alignment with the largest L; the interval is a bootstrap over the passes.
 
     Parameters
     ----------
     passes : sequence of HeardPass
-        Vehicles that turned through the view; those that came from both sides tell the yaw from the offset.
+        Vehicles that crossed the view; offset and yaw are separable only with vehicles from both sides.
 
     Returns
     -------
     Alignment
-        To be added to what the camera's file says.
+        Corrections to add to the values of the camera's file.
 
     Raises
     ------
     InvalidArgumentError
-        With fewer than five passes or fewer than two from a side, or if the best is at the edge of what is
-        looked for.
+        If there are fewer than five passes or fewer than two from one side, or if the best alignment is at
+        the edge of the search range.
     """
     _check_enough(passes)
     support = np.stack([_support(one) for one in passes])
@@ -167,7 +167,7 @@ def _check_enough(passes: Sequence[HeardPass]) -> None:
     if min(left, right) < _FEWEST_A_SIDE:
         got = f"{left} from the left, {right} from the right"
         problem = f"expected at least {_FEWEST_A_SIDE} vehicles from each side, got {got}"
-        raise InvalidArgumentError(f"passes: {problem}: a turned camera sees those of one side late or early")
+        raise InvalidArgumentError(f"passes: {problem}: from one side a yaw error looks like an offset")
 
 
 def _check_inside(offset_s: float, yaw_deg: float) -> None:
@@ -191,7 +191,7 @@ def _errors(one: HeardPass, offset_s: float, yaw_deg: float) -> FloatArray:
 
 
 def _weights(one: HeardPass, offset_s: float) -> FloatArray:
-    """Return how much each bearing counts: 1 within the boxes, 0 outside."""
+    """Return the weight of each bearing: 1 within the boxes, 0 outside."""
     at_s = one.sound_time_s - offset_s
     inside_s = np.minimum(at_s - one.box_time_s[0], one.box_time_s[-1] - at_s)
     return np.asarray(np.clip(inside_s / _TAPER_S, 0.0, 1.0))
@@ -203,7 +203,7 @@ def _gain(errors_rad: FloatArray) -> FloatArray:
 
 
 def _best(total: FloatArray) -> tuple[float, float]:
-    """Return offset and yaw of the largest value, between the points of the grid by parabolas."""
+    """Return offset and yaw of the maximum, interpolated between grid points by parabolas."""
     row, column = np.unravel_index(int(total.argmax()), total.shape)
     return _peak(_OFFSETS_S, total[:, column], int(row)), _peak(_YAWS_DEG, total[row], int(column))
 
