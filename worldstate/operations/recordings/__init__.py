@@ -1,1 +1,1 @@
-"""One recording through the whole chain: hops, advisories, channel health, the timeline figure."""
+"""Processing of one recording: hops, advisories, channel health and the timeline figure."""

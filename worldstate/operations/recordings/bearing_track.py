@@ -1,4 +1,4 @@
-"""The bearing of every hop of a recording, without a model."""
+"""Bearing of every hop of a recording, without a model."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,20 +15,20 @@ from worldstate.operations.figure_style import figure_file
 
 from .hop_table import HopTable
 
-# Bins whose covariance is decomposed to count sources: evenly out of the band.
+# Number of bins, spread evenly over the band, whose covariance is decomposed to count sources.
 _BINS = 12
-_FEWEST_FRAMES = 10  # From which their covariance means something
+_FEWEST_FRAMES = 10  # Least number for a meaningful covariance
 
 
-# Of the table as text: middle of the sound that the bearing was read from; azimuth, left positive; its
-# standard deviation; peak-to-median ratio, 1 in silence; 1 at the edge of the sector that was searched; plane
-# waves in the second that the hop ends in.
+# Columns of the text table: middle of the sound from which the bearing is estimated; azimuth, left positive;
+# its standard deviation; peak-to-median ratio, 1 in silence; 1 at the edge of the searched sector; number of
+# plane waves in the second that ends with the hop.
 _FORMS = {"time_s": ".3f", "azimuth_deg": ".2f", "std_deg": ".2f", "prominence": ".3f", "at_edge": ".0f"}
 _FORMS |= {"sources": ".0f"}
 
 
 def bearings_csv(track: HopTable) -> str:
-    """Return the table as text.
+    """Return the table as CSV text.
 
     Examples
     --------
@@ -44,7 +44,7 @@ def bearings_csv(track: HopTable) -> str:
 def track_bearings(
     audio: Audio, front_end: FrontEnd, *, count: bool = False, on_second: Callable[[], None] = lambda: None
 ) -> HopTable:
-    """Read the bearing of every hop of an open recording, and count the sources of every second."""
+    """Estimate the bearing of every hop of an open recording, and count the sources of every second."""
     rows: list[tuple[float, ...]] = []
     for block in audio.blocks(audio.sample_rate_hz):
         sources = (_sources_in(block, front_end),) if count else ()
@@ -55,7 +55,7 @@ def track_bearings(
 
 
 def write_bearings_figure(track: HopTable, path: Path, title: str) -> None:
-    """Draw azimuth over time with its standard deviation, darker where more prominent."""
+    """Draw azimuth over time with its standard deviation; darker dots are more prominent."""
     with figure_file(path, 9.0, 3.6) as figure:
         axes, places = figure.subplots(), (track.time_s, track.azimuth_deg)
         axes.errorbar(*places, track.std_deg, fmt="none", ecolor="0.85", zorder=1)
@@ -71,15 +71,15 @@ def _row(frame: AcousticFrame) -> Iterable[float]:
 
 
 def _sources_in(block: Float32Array, front_end: FrontEnd) -> int:
-    """Count plane waves by the eigenvalues of a second's covariances; 0 for less than a tenth of that."""
+    """Count plane waves by the eigenvalues of a second's covariances; 0 for less than a tenth of a second."""
     settings = front_end.settings
     band = band_bins(settings.srp_band_hz, front_end.sample_rate_hz, settings.nfft)
     chosen = np.unique(np.linspace(0, len(band) - 1, _BINS).round().astype(int))
-    # A dead microphone has no noise, beside which all that the others hear would be waves.
+    # Without the noise of a dead microphone, all sound of the others would count as waves.
     alive = block[:, np.ptp(block, axis=0) > 0.0]
     if not alive.shape[1]:
         return 0
-    # Frames overlap by half; every second one is nearly independent of the last.
+    # Frames overlap by half, so every second one is nearly independent.
     frames = StreamingStft(alive.shape[1], settings.nfft, band).push(alive)[::2][:, chosen]
     if len(frames) < _FEWEST_FRAMES:
         return 0

@@ -1,4 +1,4 @@
-"""Several cameras of a vehicle in what is listened to: each with what its own detector reported."""
+"""Several cameras of a vehicle in a source, each with the detections of its own detector."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,29 +14,29 @@ from worldstate.ground.errors import InvalidArgumentError
 
 
 def with_cameras(source: Source, car: CarSensors, detections: Mapping[str, Path | DetectionLog]) -> Source:
-    """Return what is listened to with several cameras of a car, which are asked together.
+    """Return a source with several cameras of a car, whose results are combined.
 
     Parameters
     ----------
     source : Source
-        From `open_source`; its miss rates and boxes are those of every camera that names none of its own.
+        From `open_source`; its miss rates and box filter are the defaults of every camera.
     car : CarSensors
-        Where the cameras are, how their clocks differ, and which of their boxes count.
+        Poses, clock offsets and box filters of the cameras.
     detections : mapping of str to path or DetectionLog
-        What was detected in the images of each, by its name in the car's file, on its own clock.
+        Detections of each camera on its own clock, by its name in the car file.
 
     Raises
     ------
     InvalidArgumentError
-        Without a camera, or if the car has none of such a name.
+        If no camera is given, or the car has none of that name.
     InputFileError
-        If a file is missing or damaged, or its boxes are not of images of this size.
+        If a file is missing or damaged, or its boxes are of images of another size.
     """
     channels = {}
     for name, reported in detections.items():
         camera = car.camera(name)
         if camera is None:
-            raise InvalidArgumentError(f"camera: expected a car with cameras, it has none of the name {name}")
+            raise InvalidArgumentError(f"camera: expected a car with cameras, it has none named {name}")
         channels[name] = _channel(source, camera, car.setups[name], reported)
     return replace(source, co_evidence=SeveralCameras(channels))
 

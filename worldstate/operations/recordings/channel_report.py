@@ -1,4 +1,4 @@
-"""What was wrong with the microphones of a recording, over all of its hops, where they are, in words."""
+"""Report of the microphone faults of a recording: table, text and figure."""
 
 import math
 from collections import Counter
@@ -21,36 +21,36 @@ from worldstate.ground.typing import BoolArray
 from worldstate.ground.values import LEAST_HEARD, NotUsable, seconds
 from worldstate.operations import figure_style as style
 
-# Of a rate by another clock: an error of four standard deviations is significant, one false report in 16,000.
+# For a rate by another clock: an error of 4 standard deviations is significant (one false report in 16,000).
 _SIGNIFICANT = 4.0
-# Crystals themselves are off by about as much; less changes neither bearing nor level.
+# Crystals are off by about as much; a smaller error changes neither bearing nor level.
 _TOLERATED = 1e-5
-# What a fault also looks like, before it is known or now and then.
+# Other faults that a fault resembles, before it is detected or at times.
 _EXPLAINS = {
     Fault.GUSTS: {Fault.NOISY, Fault.INTERMITTENT, Fault.DEAD, Fault.DELAY, Fault.DRIFT},
     Fault.SWAPPED: {Fault.NOISY},
     Fault.DELAY: {Fault.NOISY},
     Fault.DRIFT: {Fault.NOISY},
 }
-# Each of them misplaces the others' waves, too: what was seen in most hops is the cause, and what is left
-# shows when that is mended.
+# Each of these faults also misplaces the waves of other channels. The one seen in most hops is the cause, and
+# the remaining faults show after it is fixed.
 _MISPLACED = frozenset({Fault.SWAPPED, Fault.DELAY, Fault.DRIFT})
-# What no wave arrives at in its order: the position of a channel with a clock of its own cannot be judged.
+# The position of a channel with one of these faults cannot be judged, because no wave reaches it in order.
 _DEAF = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.DELAY, Fault.DRIFT})
-# Where to look if an array is not heard.
+# Possible causes if the whole array is unusable.
 _CAUSES = {
     NOTHING_IN_COMMON: "wind, sample format, leads",
     OUT_OF_PLACE: "order, leads and start of the channels, sample format",
 }
-# Dropouts beyond these are counted, not listed.
+# Dropouts beyond this number are counted, but not listed.
 _LISTED_DROPOUTS = 100
-# Eleven faults by six colours and two markers.
+# Eleven faults, distinguished by six colours and two markers.
 _MARKS: dict[Fault, dict[str, Any]] = {
     fault: {"color": style.CATEGORIES[i % 6], "marker": "oD"[i // 6], "alpha": 0.8, "lw": 0}
     for i, fault in enumerate(Fault)
 }
-# Areas of markers, points squared: one that holds a number of two digits, one that fits a line of the legend,
-# and how much smaller a second fault is drawn on the first.
+# Areas of markers, points squared: for a number of two digits, and for a line of the legend; and the ratio of
+# the area of a second fault to that of the first.
 _AREA, _LEGEND_AREA, _SMALLER = 240.0, 80.0, 0.55
 _VIEWS = {
     (1, 2): "seen from behind",
@@ -61,7 +61,7 @@ _VIEWS = {
 
 @dataclass(frozen=True, slots=True)
 class ChannelVerdict:
-    """One fault of one channel over a recording.
+    """One fault of one channel in a recording.
 
     Examples
     --------
@@ -70,16 +70,16 @@ class ChannelVerdict:
     """
 
     channel: int  # From 0
-    fault: Annotated[Fault, Via(str, str, Fault)]  # What is wrong
-    share: float  # Of the hops in which it was seen
+    fault: Annotated[Fault, Via(str, str, Fault)]
+    share: float  # Share of the hops in which it was detected
     first_s: float  # End of the first of these hops, seconds
-    value: float  # How wrong, when last seen: see `worldstate.frontend.health.channel_health.ChannelFault`
-    looks_like: int | None = None  # Swapped: the channel whose place it fits
+    value: float  # Last size: see `worldstate.frontend.health.channel_health.ChannelFault`
+    looks_like: int | None = None  # Swapped: the channel whose position it fits
     std: float | None = None  # Delayed and drifting: standard deviation of the value
 
     @property
     def masked(self) -> bool:
-        """Whether the front-end leaves such a channel out."""
+        """Whether the front-end excludes such a channel."""
         return self.fault in MASKED_FAULTS
 
 
@@ -111,7 +111,7 @@ class RateEstimate:
 def rate_from_duration(
     n_samples: int, duration_s: float, duration_std_s: float, nominal_hz: float
 ) -> RateEstimate:
-    r"""Estimate the sample rate from the duration of a recording by another clock, such as a camera's.
+    r"""Estimate the sample rate from a recording's duration by another clock, such as that of a camera.
 
     .. math:: \hat f_s = n / T, \qquad \sigma_{\hat f} = \hat f_s\, \sigma_T / T
     """
@@ -123,7 +123,7 @@ def rate_from_duration(
 
 @dataclass(frozen=True, slots=True)
 class RecordingHealth:
-    """Everything that was wrong with a recording.
+    """All faults of a recording.
 
     Examples
     --------
@@ -131,35 +131,35 @@ class RecordingHealth:
     True
     """
 
-    verdicts: tuple[ChannelVerdict, ...]  # By channel; empty where nothing was wrong
+    verdicts: tuple[ChannelVerdict, ...]  # By channel; empty without a fault
     dropouts: tuple[Dropout, ...]  # The first hundred
     n_dropouts: int  # All of them
     n_hops: int  # Hops processed
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
-    sample_rate: RateEstimate | None = None  # By another clock
+    sample_rate: RateEstimate | None = None  # Measured with another clock
     positions: PositionVerdict = NOTHING_AGAINST
-    unheard: str | None = None  # Why the array is not heard in most hops
+    unheard: str | None = None  # Why the array is unusable in most hops
 
     @property
     def is_healthy(self) -> bool:
-        """Whether nothing was wrong."""
+        """Whether the recording has no fault."""
         rate_is_wrong = self.sample_rate is not None and self.sample_rate.is_wrong
         wrong = self.verdicts or self.n_dropouts or rate_is_wrong or self.unheard
         return self.positions.fits and not wrong
 
     def hears_waves(self, n_channels: int) -> BoolArray:
-        """Channels whose sound is that of the others, wherever they stand, (M,)."""
+        """Return which channels share the sound of the others, at any position, shape (M,)."""
         deaf = {one.channel for one in self.verdicts if one.fault in _DEAF}
         return np.array([channel not in deaf for channel in range(n_channels)])
 
     @property
     def masked_channels(self) -> tuple[int, ...]:
-        """Channels, from 0, that the front-end left out, most of the time or now and then."""
+        """Channels, from 0, that the front-end excluded at any time."""
         return tuple(sorted({verdict.channel for verdict in self.verdicts if verdict.masked}))
 
 
 class HealthLog:
-    """Collect what the frames of a recording say about its microphones.
+    """Collect the microphone faults of a recording from its frames.
 
     Examples
     --------
@@ -183,7 +183,7 @@ class HealthLog:
         self._latest: ArrayHealth | None = None
 
     def add(self, frame: AcousticFrame) -> None:
-        """Take one hop; frames without a health report count as healthy."""
+        """Process one hop; frames without a health report are taken as healthy."""
         self._n_hops += 1
         self._unheard[frame.unheard] += frame.heard is not None and frame.heard < LEAST_HEARD
         health = frame.health
@@ -216,17 +216,17 @@ class HealthLog:
         return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in _one_cause(kept))
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:
-        """Tell a channel that was called dead while it came and went, or the other way round, mostly that."""
+        """Return whether the channel was more often intermittent than dead, or the reverse."""
         others = {Fault.DEAD: Fault.INTERMITTENT, Fault.INTERMITTENT: Fault.DEAD}
         other = self._seen.get((verdict.channel, others.get(verdict.fault, verdict.fault)))
         return other is not None and other.fault != verdict.fault and other.share > verdict.share
 
 
 def _one_cause(verdicts: list[ChannelVerdict]) -> list[ChannelVerdict]:
-    """Of misplaced channels, keep those of the fault seen in most hops that were seen in half of these."""
+    """Keep, of misplaced channels, those with the most frequent fault, in at least half as many hops."""
     misplaced = [verdict for verdict in verdicts if verdict.fault in _MISPLACED]
     if any(verdict.fault is Fault.DRIFT for verdict in misplaced):
-        # It begins as a delay.
+        # A drift begins as a delay.
         misplaced = [verdict for verdict in misplaced if verdict.fault is not Fault.DELAY]
     cause = max(misplaced, key=lambda verdict: verdict.share, default=None)
     return [
@@ -238,7 +238,7 @@ def _one_cause(verdicts: list[ChannelVerdict]) -> list[ChannelVerdict]:
 
 
 def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Path) -> None:
-    """Draw the microphones across their two widest axes, coloured by fault, channels counted from 1."""
+    """Draw the microphones along their two widest axes, coloured by fault; channels are counted from 1."""
     across, up = sorted(np.argsort(array.aperture_m)[-2:].tolist())
     place = array.centred_m[:, [across, up]]
     with style.figure_file(path, 7.5, 6.0) as figure:
@@ -257,20 +257,20 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
             axes.annotate(str(channel + 1), point, ha="center", va="center", fontsize=7.5)
         for verdict in health.verdicts:
             if verdict.looks_like is not None:
-                # Bent, so that the two arrows of a swapped pair do not cover each other.
+                # Curved, so that the two arrows of a swapped pair do not overlap.
                 arrow = {"arrowstyle": "->", "color": "black", "shrinkA": 9, "shrinkB": 9}
                 arrow["connectionstyle"] = "arc3,rad=0.2"
                 axes.annotate("", place[verdict.looks_like], place[verdict.channel], arrowprops=arrow)
         axes.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", aspect="equal")
-        axes.margins(0.08)  # whole markers at the edge
+        axes.margins(0.08)  # shows markers at the edge completely
         if across == 1:
-            axes.invert_xaxis()  # left is left
+            axes.invert_xaxis()  # so that left is on the left
         axes.set_title(f"{array.n_microphones} microphones {_VIEWS[across, up]}; channels from 1")
         style.legend_beside(axes)
 
 
 def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stance: str) -> dict[str, object]:
-    """Return the report as JSON-able values; channels are counted from 1, unknown is None."""
+    """Return the report as values for JSON; channels are counted from 1, and unknown values are None."""
     rate = health.sample_rate
     return {
         "path": str(audio.path),
@@ -327,7 +327,7 @@ def _table(verdicts: tuple[ChannelVerdict, ...]) -> Iterator[str]:
 
 
 def _cards(verdicts: tuple[ChannelVerdict, ...]) -> list[list[ChannelVerdict]]:
-    """Put consecutive channels with one delay or drift together: they are one card."""
+    """Group consecutive channels with equal delay or drift, because they share a sound card."""
     cards: list[list[ChannelVerdict]] = []
     for verdict in verdicts:
         last = cards[-1][-1] if cards else None

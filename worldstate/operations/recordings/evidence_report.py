@@ -1,4 +1,4 @@
-"""The advisories of a run, and which evidence raised or holds those of a snapshot, side by side."""
+"""Report of the advisories of a run, and of the evidence for those in a snapshot."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -36,7 +36,7 @@ _OF = {
 
 @dataclass(frozen=True, slots=True)
 class ToldAdvisory:
-    """An advisory of one side, from its onset to the last snapshot that has it.
+    """An advisory of one side, from its onset to the last snapshot that contains it.
 
     Examples
     --------
@@ -49,14 +49,14 @@ class ToldAdvisory:
     last_ns: int
 
     def line(self) -> str:
-        """Return it for people."""
+        """Return the advisory as a line of text."""
         return f"{self.direction:6s} {seconds(self.since_ns):.2f} to {seconds(self.last_ns):.2f} s"
 
 
 def told_advisories(states: Iterable[WorldState], side: str | None = None) -> tuple[list[ToldAdvisory], int]:
-    """Return advisories of one side or all by onset, and the first onset, or when risk was highest.
+    """Return all advisories, or those of one side, by onset, and the first onset or time of highest risk.
 
-    The first one may have begun before the first snapshot, whose time it is then.
+    If the first advisory began before the first snapshot, the time of that snapshot is returned.
     """
     last_ns: dict[tuple[int, str], int] = {}
     highest, riskiest_ns, first_ns = -1.0, 0, None
@@ -75,7 +75,7 @@ def told_advisories(states: Iterable[WorldState], side: str | None = None) -> tu
 
 @dataclass(frozen=True, slots=True)
 class SideEvidenceReport:
-    """What is known of one side's advisory, at a time and at its onset.
+    """State of one side's advisory at a time and at its onset.
 
     Examples
     --------
@@ -87,13 +87,13 @@ class SideEvidenceReport:
     """
 
     cue: RiskCue
-    onset: RiskCue | None  # When the advisory began; None without one, or where the file begins later
+    onset: RiskCue | None  # Cue at the start of the advisory; None without one, or if the file begins later
     entity: Entity | None
     calibrated: bool = True
 
     @property
     def standing(self) -> Standing:
-        """Whether the advisory is raised now, held, or why there is none."""
+        """Whether the advisory is raised or held now, or why there is none."""
         evidence = self.cue.evidence
         above = evidence is not None and evidence.compared_nats >= evidence.threshold_nats
         if self.cue.advisory is None:
@@ -101,7 +101,7 @@ class SideEvidenceReport:
         return "raised" if self.cue.held is None else "held"
 
     def to_dict(self) -> dict[str, object]:
-        """Return it as JSON-able values."""
+        """Return the report as values for JSON."""
         onset = self.onset.evidence if self.onset is not None else None
         return {
             "standing": self.standing,
@@ -111,7 +111,7 @@ class SideEvidenceReport:
         }
 
     def lines(self, now_s: float) -> Iterator[str]:
-        """Yield it for people."""
+        """Yield the lines of the report."""
         cue, told = self.cue, self.cue.advisory
         said = _SAID[self.standing] if self.calibrated else _SAID[self.standing].partition(":")[0]
         yield f"{cue.direction or 'side unknown'}: advisory {said}"
@@ -152,7 +152,7 @@ class SideEvidenceReport:
 def evidence_report(
     state: WorldState, read: Callable[[int], WorldState], side: str | None = None
 ) -> dict[str, SideEvidenceReport]:
-    """Return the report of every side, or one; `read` returns the state in which an advisory began."""
+    """Return the report of every side, or one; `read` returns the state at the onset of an advisory."""
     entities = {entity.id: entity for entity in state.entities}
     reports = {}
     for cue in state.cues:
@@ -165,13 +165,13 @@ def evidence_report(
 
 
 def _cues_at(read: Callable[[int], WorldState], stamp_ns: int) -> tuple[RiskCue, ...]:
-    """Return the cues at a time, none where a log begins later, within an advisory."""
+    """Return the cues at a time; none if the log begins later."""
     state = read(stamp_ns)
     return state.cues if state.stamp_ns - stamp_ns <= _SAME_NS else ()
 
 
 def common_lines(state: WorldState) -> Iterator[str]:
-    """Yield what all sides share: sound, looks, the state of the sensors, what has just happened."""
+    """Yield lines that are common to all sides: sound, looks, state of the sensors, latest events."""
     if state.calibrated and state.budget is not None:
         yield f"budget: {_promised(state.budget)}"
     if isinstance(state.domain, Foreign):
@@ -197,7 +197,7 @@ def common_lines(state: WorldState) -> Iterator[str]:
 
 
 def sentence(state: WorldState) -> str:
-    """Return what a person reads first: the advisories, or the highest risk, and whether to act on it.
+    """Return a one-sentence summary: the advisories or the highest risk, and why the cues are not usable.
 
     Examples
     --------
@@ -228,7 +228,7 @@ def _announced(cue: RiskCue) -> str:
 
 
 def _promised(budget: Budget) -> str:
-    """Return what was asked of the alarm, and what its curve promises."""
+    """Return the requested budget of the alarm, and the rates that its curve predicts for it."""
     asked, promise = f"{budget.onsets_per_hour:g} onsets an hour", budget.promise
     if budget.asked_alpha is not None:
         asked = f"{budget.asked_alpha:.2%} of the time without hazards"
@@ -240,7 +240,7 @@ def _promised(budget: Budget) -> str:
 
 
 def _row(name: str, *nats: float) -> str:
-    # Of what rounds to nothing the sign says nothing.
+    # Adding 0.0 removes the sign of a value that rounds to zero.
     return f"    {name:16s}{''.join(f'{round(value, 2) + 0.0:+14.2f}' for value in nats)}"
 
 

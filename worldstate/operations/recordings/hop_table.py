@@ -1,4 +1,4 @@
-"""A recording as a table: one row a hop, columns by name."""
+"""A recording as a table, with one row per hop and named columns."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,44 +18,44 @@ from worldstate.ground.typing import AnyArray, BoolArray
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.metrics.approach_table import SLACK_S
 
-# An hour of hops with a feature of 60 values each takes 20 MB.
+# One hour of hops with a feature of 60 values takes 20 MB.
 MAX_BYTES = 512 << 20
 MAX_RECORDINGS = 100_000
 MAX_HEAD_BYTES = 64 << 20
-# Files of other versions are caches of other code: they are refused, and made again where they can be.
+# Files of other versions are caches of other code: they are refused, and made again if possible.
 VERSION = 3
 
 HOP_S = 0.1
 UNQUERIED, ABSENT, PRESENT = 0, 1, 2
-# Of a hop stream: what a recording gave at every hop, kept so that decisions can be tried on it again.
+# Columns of a hop stream: the evidence of a recording at every hop, stored to try decisions on it again.
 STREAM_COLUMNS = (
     "time_s",  # End of each window, seconds from the start
-    "log_likelihoods",  # shape (n, K + 2): Of hidden_1 .. hidden_K, visible, none; nats
+    "log_likelihoods",  # shape (n, K + 2): for hidden_1 .. hidden_K, visible, none; nats
     "answer",  # 0 unqueried, 1 absent, 2 present
-    "miss_rate",  # Of the channel that was asked; 1 and 0 where none was
+    "miss_rate",  # Of the searched channel; without one, miss rate 1 and clutter rate 0
     "clutter_rate",
-    "approach",  # 1/TTA over its standard deviation; NaN where not usable
-    "seen",  # Whether a moving object was reported anywhere
-    "there",  # Whether one was in view, by a reference where there is one: what a degraded camera may miss
+    "approach",  # 1/TTA over its standard deviation; NaN if unusable
+    "seen",  # Whether a moving object was detected anywhere
+    "there",  # Whether one was in view by the reference, if there is one: a degraded camera may miss it
 )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HopTable:
-    """Columns of equal length, and what holds for the whole recording; a column is read as an attribute.
+    """Columns of equal length and data of the whole recording; columns are also attributes.
 
     Parameters
     ----------
     columns : mapping of str to ndarray, shape (n, ...)
-        One row a hop.
+        One row per hop.
     name : str
-        Of the recording.
+        Name of the recording.
     label : str
-        Side that a vehicle comes from, or "none" for a hazard-free recording.
+        Side from which a vehicle comes, or "none" for a hazard-free recording.
     t0_s : float
-        Line-of-sight entry, seconds; NaN where there is none or it is not known.
+        Line-of-sight entry, seconds; NaN if there is none or it is unknown.
     about : mapping
-        Whatever else, ready for JSON.
+        Further data, suitable for JSON.
 
     Raises
     ------
@@ -83,14 +83,14 @@ class HopTable:
         return len(next(iter(self.columns.values()), ()))
 
     def __getattr__(self, name: str) -> AnyArray:
-        # Without the first test a half-built copy, as pickle makes one, would look for `columns` for ever.
+        # The first test prevents endless recursion in a partly constructed copy, such as during unpickling.
         if name == "columns" or name not in self.columns:
             raise AttributeError(f"no column {name}")
         return self.columns[name]
 
     @classmethod
     def of_rows(cls, names: Sequence[str], rows: Iterable[Sequence[Any]]) -> "HopTable":
-        """Return the table of rows with one value a column.
+        """Return the table of rows with one value per column.
 
         Examples
         --------
@@ -107,16 +107,16 @@ class HopTable:
 
     @property
     def hazard_free(self) -> bool:
-        """Whether nothing approaches in this recording."""
+        """Whether no vehicle approaches in this recording."""
         return self.label == "none"
 
     def before_sight(self, horizon_s: float = float("inf")) -> BoolArray:
-        """Hops of an approach that end within `horizon_s` before T0, T0 included, shape (n,)."""
+        """Return which hops of an approach end at T0 or at most `horizon_s` before it, shape (n,)."""
         left_s = self.t0_s - self.time_s
         return np.asarray((left_s >= -SLACK_S) & (left_s <= horizon_s + SLACK_S) & (not self.hazard_free))
 
     def after_sight(self) -> BoolArray:
-        """Hops of an approach after T0 with the vehicle in view, which column `there` says, shape (n,)."""
+        """Return which hops of an approach are after T0 with the vehicle in view (`there`), shape (n,)."""
         return np.asarray(self.there & ~self.before_sight() & (not self.hazard_free))
 
 
@@ -124,7 +124,7 @@ _OWN = tuple(one.name for one in fields(HopTable) if one.name != "columns")
 
 
 def joined(tables: Iterable[HopTable]) -> HopTable:
-    """Return the rows of several recordings, of the columns of the first, as one nameless table.
+    """Return the rows of several recordings as one table without a name, with the columns of the first.
 
     Examples
     --------
@@ -137,17 +137,17 @@ def joined(tables: Iterable[HopTable]) -> HopTable:
 
 
 def save_tables(path: str | Path, tables: Iterable[HopTable]) -> None:
-    """Write recordings with the same columns as npz without objects, whole or not at all."""
+    """Write recordings with the same columns as npz without objects, atomically."""
     _save(path, {"": list(tables)})
 
 
 def save_named(path: str | Path, tables: Mapping[str, HopTable]) -> None:
-    """Write tables with columns of their own as npz without objects, whole or not at all."""
+    """Write tables with different columns as npz without objects, atomically."""
     _save(path, {name: [table] for name, table in tables.items()})
 
 
 def load_named(path: str | Path, what: str) -> dict[str, HopTable]:
-    """Read what `save_named` wrote.
+    """Read a file written by `save_named`.
 
     Examples
     --------
@@ -162,8 +162,8 @@ def load_named(path: str | Path, what: str) -> dict[str, HopTable]:
 
 
 def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]]) -> None:
-    """Write tables by kind: those of one kind have the same columns, which are stored end to end."""
-    # One array a recording and column would make a list of members that the reader refuses as too long.
+    """Write tables by kind; tables of one kind have the same columns, which are concatenated."""
+    # With one array per recording and column, the list of members would exceed the reader's limit.
     about = [
         {name: getattr(one, name) for name in _OWN} | {"kind": kind, "hops": len(one)}
         for kind, tables in kinds.items()
@@ -171,7 +171,7 @@ def _save(path: str | Path, kinds: Mapping[str, Sequence[HopTable]]) -> None:
     ]
     head = {"version": VERSION, "recordings": about}
     columns = {
-        # Columns of the nameless kind keep their names.
+        # Columns of the kind without a name keep their names.
         f"{kind}/{name}" if kind else name: column
         for kind, tables in kinds.items()
         for name, column in joined(tables).columns.items()
@@ -190,7 +190,7 @@ def _tables(arrays: dict[str, AnyArray]) -> dict[str, list[HopTable]]:
         raise InvalidArgumentError(f"expected at most {MAX_RECORDINGS} tables, got {len(head['recordings'])}")
     kinds: dict[str, list[dict[str, Any]]] = {}
     for one in head["recordings"]:
-        # Files from before there were kinds hold the nameless one.
+        # Older files without kinds contain the kind without a name.
         kinds.setdefault(one.pop("kind", ""), []).append(one)
     columns: dict[str, dict[str, AnyArray]] = {kind: {} for kind in kinds}
     for member, column in arrays.items():
@@ -200,7 +200,7 @@ def _tables(arrays: dict[str, AnyArray]) -> dict[str, list[HopTable]]:
 
 
 def _split(about: Sequence[dict[str, Any]], columns: Mapping[str, AnyArray]) -> list[HopTable]:
-    """Return the tables of one kind from their columns end to end."""
+    """Split the concatenated columns of one kind into its tables."""
     hops = [int(one.pop("hops")) for one in about]
     if min(hops) < 0 or any(len(column) != sum(hops) for column in columns.values()):
         raise InvalidArgumentError("hops: expected counts that sum to the number of rows")
@@ -216,7 +216,7 @@ def hop_stream(
     t0_s: float | None = None,
     there: Sequence[bool] | None = None,
 ) -> HopTable:
-    """Record what an adapter measured."""
+    """Return the measurements of an adapter as a hop stream."""
     measured = list(measurements)
     if not measured:
         raise InvalidArgumentError(f"{name}: expected at least one hop, so at least one second of sound")
@@ -228,7 +228,7 @@ def hop_stream(
 
 
 def load_streams(path: str | Path) -> list[HopTable]:
-    """Read the hop streams that `save_tables` wrote, and check them: a user may bring them."""
+    """Read and validate the hop streams of a file, which may come from a user."""
 
     def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
         streams = _tables(arrays).get("", [])
@@ -260,12 +260,12 @@ def _answer(co_evidence: CoEvidence) -> tuple[int, float, float]:
 
 
 def _measured(one: Measurement) -> tuple[Any, ...]:
-    """Return the columns of a hop but for the last two."""
+    """Return the columns of a hop except the last two."""
     heard, approach = one.signature.log_likelihoods, one.approach
     rate = np.nan if isinstance(approach, NotUsable) else approach.inverse_tta_hz / approach.std_hz
     return seconds(one.stamp_ns), heard, *_answer(one.co_evidence), rate
 
 
 def signature_checksum(signature: object) -> int:
-    """Return a checksum of a window model, by which its scores are told from another one's."""
+    """Return a checksum of a window model that identifies its scores."""
     return crc32(json.dumps(encode(signature)).encode())

@@ -1,4 +1,4 @@
-"""Run one recording through the whole chain: how its advisories stood to line-of-sight entry, its health."""
+"""Processing of one recording: its advisories relative to line-of-sight entry, and microphone health."""
 
 import math
 import time
@@ -21,26 +21,26 @@ from .channel_report import HealthLog, RecordingHealth
 
 @dataclass(frozen=True, slots=True)
 class WarningSummary:
-    """How the advisory stood to line-of-sight entry in one recording."""
+    """Advisories of one recording relative to line-of-sight entry."""
 
-    # Line-of-sight entry, seconds from the start; None where unknown or nothing approaches.
+    # Line-of-sight entry, seconds from the start; None if unknown or nothing approaches.
     t0_s: float | None
-    # First onset not earlier than 5 s before `t0_s`; without a `t0_s` the first onset of all.
+    # First onset from 5 s before `t0_s` on; without a `t0_s` the first onset of all.
     first_advisory_s: float | None
-    lead_time_s: float | None  # `t0_s - first_advisory_s` where that onset came before line-of-sight entry
-    # Onsets more than 5 s before `t0_s`, every onset of a hazard-free recording; None where neither is known.
+    lead_time_s: float | None  # `t0_s - first_advisory_s` if that onset is before line-of-sight entry
+    # Onsets more than 5 s before `t0_s`, or all onsets of a hazard-free recording; None if neither is known.
     false_advisories_before: int | None
-    # Onsets at or after `t0_s`: of a vehicle that can be seen, or that has just left the view. None without.
+    # Onsets at or after `t0_s`, when the vehicle is in view or has just left it; None without a `t0_s`.
     advisories_after_t0: int | None
     advisory_onsets_s: tuple[float, ...]  # All rising edges of the advisory
-    # The entity that the last advisory before `t0_s` spoke of; without a `t0_s`, or where none led, that of
-    # the first advisory counted.
+    # The entity of the last advisory before `t0_s`; without a `t0_s` or such an advisory, that of the first
+    # advisory from 5 s before `t0_s` on.
     hidden_entity_id: str | None
     visible_entity_id: str | None  # The first moving entity that came into view
 
 
 def calibration_words(uncalibrated: int, hops: int) -> str:
-    """Return in words whether the cues kept to a false-alarm budget in all hops, in some or in none.
+    """Return in words in how many hops the cues met a false-alarm budget.
 
     Examples
     --------
@@ -54,25 +54,25 @@ def calibration_words(uncalibrated: int, hops: int) -> str:
 
 @dataclass(slots=True)
 class WarningMeter:
-    """Counts states and advisories while they go by, and keeps none of them."""
+    """Counts states and advisories of a recording without storing them."""
 
     t0_s: float | None  # Line-of-sight entry on the clock of the states, seconds
-    hazard_free: bool = False  # Whether the recording is known to hold no vehicle
+    hazard_free: bool = False  # Whether the recording is known to contain no vehicle
     states: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    peak_risk: float | None = None  # None until a state has stated a risk
-    uncalibrated: int = 0  # States whose cues keep to no budget
-    unusable: int = 0  # States with a cue that is not usable
-    reasons: Counter[str] = field(default_factory=Counter)  # States by why not
-    sounds: set[str] = field(default_factory=set)  # Tracks of sound, if no model reads it
+    peak_risk: float | None = None  # None before the first state with a risk
+    uncalibrated: int = 0  # Number of states without a budget
+    unusable: int = 0  # Number of states with a cue that is not usable
+    reasons: Counter[str] = field(default_factory=Counter)  # Number of states by reason
+    sounds: set[str] = field(default_factory=set)  # Tracks of sound without a model
     _onsets: list[tuple[float, str | None]] = field(default_factory=list)
     _raised: bool = False
     _hidden_id: str | None = None
     _visible_id: str | None = None
 
     def update(self, state: WorldState) -> None:
-        """Take in the next state of the recording."""
+        """Process the next state of the recording."""
         self.first_ns, self.last_ns = self.first_ns if self.states else state.stamp_ns, state.stamp_ns
         self.states += 1
         self.peak_risk = max((one for one in (self.peak_risk, state.risk) if one is not None), default=None)
@@ -87,7 +87,7 @@ class WarningMeter:
         if raised:
             now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk or 0.0).entity_id
             if not self._raised:
-                # The first one of a log may have begun before it.
+                # The first advisory of a log may have begun before the log.
                 since_ns = min(cue.advisory.since_ns for cue in raised if cue.advisory is not None)
                 self._onsets.append((seconds(since_ns) if self.states == 1 else now_s, told))
             if self.t0_s is not None and now_s < self.t0_s:
@@ -99,7 +99,7 @@ class WarningMeter:
 
     @property
     def usable(self) -> str:
-        """In words: in how many states the cues could be acted on, and in how many each reason was given."""
+        """Number of states with usable cues, and of states with each reason against, in words."""
         if not self.unusable:
             return "in every hop"
         given = ", ".join(f"{reason} {number}" for reason, number in self.reasons.items())
@@ -107,12 +107,12 @@ class WarningMeter:
 
     @property
     def words(self) -> dict[str, object]:
-        """Whether the cues kept to a budget, and could be acted on; how many sounds were followed."""
+        """Calibration and usability of the cues in words, and without a model the number of sound tracks."""
         stated = {"calibration": calibration_words(self.uncalibrated, self.states), "usable": self.usable}
         return stated | ({"sounds": len(self.sounds)} if "no model" in self.reasons else {})
 
     def summary(self) -> WarningSummary:
-        """Return the figures of all states so far."""
+        """Return the summary of all states so far."""
         onsets_s = tuple(time_s for time_s, _ in self._onsets)
         found = None if self.t0_s is None else onset_outcome(onsets_s, self.t0_s)
         false = found.onsets_earlier if found else len(onsets_s) if self.hazard_free else None
@@ -133,25 +133,25 @@ class WarningMeter:
 
 @dataclass(frozen=True, slots=True)
 class RecordingReport:
-    """Outcome of one recording.
+    """Results of one recording.
 
     Parameters
     ----------
     warning : WarningSummary
-        Advisories against line-of-sight entry.
+        Advisories relative to line-of-sight entry.
     hops : int
-        Decisions taken.
+        Number of decisions.
     peak_risk : float or None
-        Largest risk of all hops; None if none states one.
+        Largest risk of all hops; None if no hop has one.
     realtime_factor : float
-        Seconds of audio per second of wall time, the whole chain.
+        Seconds of audio per second of wall time, for the whole chain.
     health : RecordingHealth
-        What was wrong with the microphones.
+        Faults of the microphones.
     words : mapping of str to object
-        Whether the cues kept to a budget of false alarms, in how many hops they could be acted on, and
-        without a model how many sounds were followed.
+        Whether the cues met a false-alarm budget, in how many hops they were usable, and without a model the
+        number of tracked sounds.
     end : Checkpoint or None
-        Belief and site after the last hop, to go on from; None where there was none.
+        Belief and site after the last hop, from which processing can continue; None without one.
 
     Examples
     --------
@@ -178,7 +178,7 @@ class RecordingReport:
     end: Checkpoint | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """Return the summary as JSON-able values; unknown is None, microphones are counted from 1."""
+        """Return the summary as values for JSON; unknown values are None, microphones are counted from 1."""
         figures = {"hops": self.hops, "peak_risk": self.peak_risk, "realtime_factor": self.realtime_factor}
         masked = {"masked_microphones": [channel + 1 for channel in self.health.masked_channels]}
         return asdict(self.warning) | figures | masked | {**self.words}
@@ -187,21 +187,21 @@ class RecordingReport:
 def run_recording(
     source: Source, *, states_path: Path | None = None, on_hop: Callable[[Step], None] = lambda step: None
 ) -> RecordingReport:
-    """Listen to `source` to its end.
+    """Process `source` to its end.
 
     Parameters
     ----------
     source : Source
         From `open_source`.
     states_path : Path, optional
-        Where to write one snapshot a line; nothing half-written is left on an error.
+        File for one snapshot per line; after an error no partial file remains.
     on_hop : callable
         Called after each hop, for progress.
 
     Returns
     -------
     RecordingReport
-        Warnings and health.
+        Summary of advisories and health.
 
     Raises
     ------
@@ -210,7 +210,7 @@ def run_recording(
 
     Examples
     --------
-    A second and a fifth of noise:
+    1.2 s of noise:
 
     >>> import numpy as np
     >>> import soundfile
@@ -241,16 +241,16 @@ def run_recording(
 
 
 def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehicle: str = "a vehicle") -> str:
-    """Return in one sentence how long before it came into sight each vehicle was announced.
+    """Return in one sentence how long each vehicle was announced before it came into sight.
 
     Parameters
     ----------
     states : iterable of WorldState
-        Of one recording.
+        States of one recording.
     truth : sequence of TrueTrack
-        Its vehicles; those that were in sight from the beginning, or never were, are not spoken of.
+        Its vehicles; those in sight from the start, or never, are skipped.
     vehicle : str
-        What they are called.
+        Term for a vehicle.
 
     Examples
     --------
@@ -264,7 +264,7 @@ def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehic
         return f"no vehicle came into sight{told}"
     sentences, before_s = [], dict[str, float]()
     for first_s, last_s, side in came:
-        # What was announced of the one before it has ended with that one's hand-over.
+        # An earlier announcement belongs to the vehicle before, and ended with its hand-over.
         own_s = [time_s for time_s in onsets.get(side, ()) if time_s > before_s.get(side, -math.inf)]
         sentences.append(f"{vehicle} from the {side} was {_announced(own_s, first_s, last_s)}")
         before_s[side] = first_s
@@ -276,7 +276,7 @@ def _side(track: TrueTrack) -> str:
 
 
 def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
-    """Return when an advisory began, seconds, of each side that had one."""
+    """Return the onset times of advisories by side, seconds."""
     onsets, standing = dict[str, list[float]](), set[str]()
     for state in states:
         raised = {cue.direction for cue in state.cues if cue.advisory and cue.direction}
@@ -287,7 +287,7 @@ def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
 
 
 def _announced(onsets_s: Sequence[float], first_s: float, last_s: float) -> str:
-    """Return how the onsets of its side stood to the time in which a vehicle was in sight."""
+    """Describe the onsets of a vehicle's side relative to the time in which it was in sight."""
     found = onset_outcome(onsets_s, first_s)
     if found.lead_s:
         return f"announced {found.lead_s:.1f} s before it came into sight"
