@@ -1,1 +1,1 @@
-"""Figures of merit that need nothing but labels and scores."""
+"""Figures of merit from labels and scores alone."""

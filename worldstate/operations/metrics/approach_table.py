@@ -1,7 +1,7 @@
-"""Approaches and hazard-free hours under an alarm: what is detected, how early, and how many false alarms.
+"""Detection rate, lead time and false-alarm rate of an alarm on approaches and hazard-free time.
 
-Onsets and leads are counted here and nowhere else. A study makes one outcome of each approach, keeps the
-alarm of each hazard-free stream, and asks the table of both for its figures:
+All onsets and leads are computed here. A study makes one outcome per approach, keeps the alarm of each
+hazard-free stream, and computes the figures from the table of both:
 
 >>> calm = np.zeros(36_000, bool)
 >>> calm[100:140] = True
@@ -10,10 +10,10 @@ alarm of each hazard-free stream, and asks the table of both for its figures:
 >>> found["detected"], found["lead_s"], found["lead_missed_as_0_s"], found["onsets_per_hour"]
 (0.5, 1.5, 0.75, 1.0)
 
-A detection is defined in two ways, and each kind of data keeps its own. A recording holds one approach,
-and the first *onset* counts: `onset_outcome`. In a stream an alarm may stand since the approach before,
-and either side may be named; the first *hop* in alarm counts: `hop_outcome`. Onsets more
-than five seconds before T0, and hops before the risk's horizon of eight, belong to something else.
+There are two definitions of a detection, one for each kind of data. A recording contains one approach, and
+its first *onset* is decisive: `onset_outcome`. In a stream an alarm may continue from the approach before,
+and either side may be in alarm, so the first *hop* in alarm is decisive: `hop_outcome`. Onsets more than 5 s
+before T0, and hops more than 8 s (the risk's horizon) before it, are attributed to other events.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,14 @@ from worldstate.ground.values import SECONDS_PER_HOUR
 
 
 def auroc(scores: ArrayLike, positive: ArrayLike) -> float | None:
-    r"""Return the area under the ROC curve, None where a label is missing altogether.
+    r"""Return the area under the ROC curve; None if one of the two labels does not occur.
 
     .. math:: P(s^+ > s^-) + P(s^+ = s^-) / 2
 
     Parameters
     ----------
     scores : array_like, shape (n,)
-        Larger for positives, one hopes.
+        Scores, larger for positives.
     positive : array_like of bool, shape (n,)
         Labels.
 
@@ -81,34 +81,35 @@ def rank_wins(positives: Sequence[FloatArray], negatives: Sequence[FloatArray]) 
     wins = np.zeros((len(positives), len(negatives)))
     for q, one in enumerate(map(np.sort, negatives)):
         below = (np.searchsorted(one, scores, "left") + np.searchsorted(one, scores, "right")) / 2.0
-        # Halves are exact in binary, so differences of the running sum are.
+        # Halves are exact in binary, so differences of the running sum are exact too.
         wins[:, q] = np.diff(np.concatenate([[0.0], np.cumsum(below)])[ends])
     return wins
 
 
 Figures = dict[str, float | int | None]
 LONGEST_LEAD_S, AFTER_S = 5.0, 6.0
-NEAR_S = 1.5  # Two vehicles with a smaller gap are heard in one window and its fades
-# A hop ends with a whole sample, T0 is a camera frame: one that ends at T0 misses it by 10 us and more.
+NEAR_S = 1.5  # The sound of two vehicles with a smaller gap overlaps in one window
+# A hop ends with a sample and T0 is a camera frame, so a hop that ends at T0 differs from it by 10 us or
+# more.
 SLACK_S = 1e-3
-# With fewer, one recording moves a rate by more than 5 % and most intervals span what is of interest.
+# With fewer, one recording changes a rate by more than 5 %, and most intervals are too wide to be useful.
 FEWEST_RECORDINGS = 20
 
 
 @dataclass(frozen=True, slots=True)
 class StreamApproach:
-    """Vehicles that belong together, the first to come into view first."""
+    """Vehicles of one approach, in the order in which they come into view."""
 
     flow: str = "single"  # "single", "both" or "queue"
     entries_s: tuple[float, ...] = ()
     sides: tuple[int, ...] = ()
     kinds: tuple[str, ...] = ()
-    quiet: bool = False  # Whether any of them is a quiet road user, which has no target of its own
+    quiet: bool = False  # Whether any of them is a quiet road user, for which no target is set
 
 
 @dataclass(frozen=True, slots=True)
 class ApproachOutcome:
-    """What an alarm made of one approach.
+    """Result of an alarm for one approach.
 
     Examples
     --------
@@ -116,28 +117,29 @@ class ApproachOutcome:
     (True, False)
     """
 
-    lead_s: float  # From the first alarm that counts to T0; 0 where missed
-    onsets: int = 0  # In the seconds before T0 that count
+    lead_s: float  # From the first valid alarm to T0; 0 if missed
+    onsets: int = 0  # In the valid seconds before T0
     onsets_earlier: int = 0  # Before those
-    onsets_after: int = 0  # In the six seconds after the last T0, of a stream
-    # Whether the side of the first vehicle, the other one and the side of every vehicle were named, each in
-    # the seconds before its T0 that count; of a stream.
+    onsets_after: int = 0  # In the 6 s after the last T0 (streams only)
+    # Whether the side of the first vehicle, the other side, and the sides of all vehicles were in alarm, each
+    # in the valid seconds before its T0 (streams only).
     own_side: bool = False
     other_side: bool = False
     every_side: bool = False
-    # Whether any side was in alarm in the last second before T0, and in the last hop before it; of a stream.
+    # Whether any side was in alarm in the last second before T0, and in the last hop before it (streams
+    # only).
     last_second: bool = False
     at_t0: bool = False
     approach: StreamApproach = StreamApproach()
 
     @property
     def detected(self) -> bool:
-        """Whether an alarm came before line of sight."""
+        """Whether an alarm began before line of sight."""
         return self.lead_s > 0.0
 
 
 def rising_edges(alarm: ArrayLike) -> IndexArray:
-    """Return the hops at which an alarm begins; one that is on from the first hop begins there.
+    """Return the hops at which an alarm begins; an initial alarm begins at the first hop.
 
     Examples
     --------
@@ -149,7 +151,7 @@ def rising_edges(alarm: ArrayLike) -> IndexArray:
 
 
 def onset_outcome(onsets_s: ArrayLike, t0_s: float) -> ApproachOutcome:
-    """Compare the onsets of one recording with its line-of-sight entry, both in seconds from its start.
+    """Compare the onsets of one recording with its line-of-sight entry, in seconds from its start.
 
     Examples
     --------
@@ -163,15 +165,15 @@ def onset_outcome(onsets_s: ArrayLike, t0_s: float) -> ApproachOutcome:
     return ApproachOutcome(float(counted.max(initial=0.0)), counted.size, int(early.sum()))
 
 
-HORIZON_S = COMING_S[-1]  # Of the risk: an alarm earlier than that is about something else
+HORIZON_S = COMING_S[-1]  # Horizon of the risk: earlier alarms belong to other events
 
 
 def hop_outcome(
     approach: StreamApproach, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
 ) -> ApproachOutcome:
-    """Return the outcome of one approach of a stream: time_s (n,), alarm of either side (n, 2).
+    """Return the outcome of one approach in a stream: time_s (n,), alarm of either side (n, 2).
 
-    Alarms count from `longest_s` before T0 on.
+    Alarms are valid from `longest_s` before T0.
 
     Examples
     --------
@@ -201,13 +203,13 @@ def hop_outcome(
 
 
 def shortly_before(time_s: FloatArray, entry_s: float, longest_s: float = HORIZON_S) -> BoolArray:
-    """Return the hops of the last seconds before a T0, shape (n,)."""
+    """Return the hops in the last seconds before a T0, shape (n,)."""
     return np.asarray((time_s > entry_s - longest_s) & (time_s < entry_s - SLACK_S))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ApproachTable:
-    """Outcomes of approaches, and the alarms of hazard-free streams, of shape (n,), or (n, 2) by side.
+    """Outcomes of approaches, and alarms of hazard-free streams, shape (n,), or (n, 2) by side.
 
     Examples
     --------
@@ -221,20 +223,20 @@ class ApproachTable:
 
     @property
     def hours(self) -> float:
-        """Scored hazard-free time."""
+        """Hours of evaluated hazard-free time."""
         return sum(map(len, self.hazard_free)) * HOP_S / SECONDS_PER_HOUR
 
     @property
     def onsets(self) -> int:
-        """False alarms: rising edges in hazard-free time."""
+        """Number of false alarms: rising edges in hazard-free time."""
         return sum(rising_edges(alarm).size for alarm in self._alarms())
 
     def figures(self) -> Figures:
-        """Return what is detected and what false alarms it costs, None where there is nothing to count."""
+        """Return detection and false-alarm figures; None for those without data."""
         return self.detections() | self.false_alarms()
 
     def detections(self) -> Figures:
-        """Return the share detected with its exact 95 % interval, and the mean lead, misses left out or 0."""
+        """Return detected share with exact 95 % interval, and mean lead, with misses excluded and as 0."""
         detected = [one.detected for one in self.outcomes]
         low, high = share_interval(sum(detected), len(detected)) if detected else (None, None)
         return {
@@ -247,14 +249,14 @@ class ApproachTable:
         }
 
     def standing(self) -> Figures:
-        """Return how often an alarm stands in the last second before T0, and in the last hop before it."""
+        """Return how often an alarm is active in the last second, and in the last hop, before T0."""
         return {
             "advised_last_second": mean_of([one.last_second for one in self.outcomes]),
             "advised_at_t0": mean_of([one.at_t0 for one in self.outcomes]),
         }
 
     def sides(self) -> Figures:
-        """Return how often single vehicles are announced from the other side, and both of two are found."""
+        """Return how often single vehicles are announced from the other side, and pairs on both sides."""
         singles, both = (self.of_flow(flow).outcomes for flow in ("single", "both"))
         gaps_s = (one.approach.entries_s[-1] - one.approach.entries_s[0] for one in both)
         near = [one.every_side for one, gap_s in zip(both, gaps_s, strict=True) if gap_s < NEAR_S]
@@ -269,7 +271,7 @@ class ApproachTable:
         }
 
     def false_alarms(self) -> Figures:
-        """Return onsets an hour of hazard-free time with the exact interval, and the share of it in alarm."""
+        """Return onsets per hazard-free hour with the exact interval, and the share of that time in alarm."""
         if not self.hours:
             return {"hazard_free_hours": 0.0, "onsets_per_hour": None, "hazard_free_share": None}
         low, high = poisson_interval(self.onsets, self.hours)
@@ -282,7 +284,7 @@ class ApproachTable:
         }
 
     def of_flow(self, flow: str) -> "ApproachTable":
-        """Return the table of the approaches of one flow."""
+        """Return the table with the approaches of one flow."""
         return ApproachTable([one for one in self.outcomes if one.approach.flow == flow], self.hazard_free)
 
     def loud(self) -> "ApproachTable":
@@ -294,12 +296,12 @@ class ApproachTable:
 
 
 def mean_of(values: Sequence[float] | Sequence[bool] | FloatArray | BoolArray) -> float | None:
-    """Return the mean, None of nothing."""
+    """Return the mean, None for no values."""
     return float(np.mean(values)) if len(values) else None
 
 
 def caution(count: int, what: str = "recordings") -> str | None:
-    """Return what to say of figures from so few; None from 20 on.
+    """Return a caution for figures from too few recordings; None from 20 on.
 
     Examples
     --------
@@ -312,7 +314,7 @@ def caution(count: int, what: str = "recordings") -> str | None:
 
 
 def poisson_interval(count: float, exposure: float, confidence: float = 0.95) -> tuple[float, float]:
-    r"""Return the exact interval of a Poisson rate, alarms an hour if the exposure is in hours.
+    r"""Return the exact interval of a Poisson rate, in alarms per hour if the exposure is in hours.
 
     .. math:: \left[\chi^2_{\alpha/2}(2n),\ \chi^2_{1-\alpha/2}(2n + 2)\right] / 2T
 
@@ -323,7 +325,7 @@ def poisson_interval(count: float, exposure: float, confidence: float = 0.95) ->
     (0.0, 35.8)
     """
     # F. Garwood, "Fiducial limits for the Poisson distribution", Biometrika 28, 1936. One alarm more or less
-    # moves the rate by 1 / T, so without any alarm the high end says how little the hours can tell.
+    # changes the rate by 1 / T, so without any alarm the upper end shows how little data there are.
     from scipy.special import gammaincinv
 
     whole = in_range("count", count, 0, np.inf)
