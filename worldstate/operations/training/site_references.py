@@ -1,4 +1,4 @@
-"""What windows are compared with: curated windows of their site, or a stream heard before."""
+"""References for the comparison of windows: curated windows of their site, or an earlier stream."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,16 +12,16 @@ from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-# What a vehicle has heard of a street after its first ten seconds: nearly always an empty street.
+# Contents of a stream's first ten seconds: nearly always an empty street.
 STREAM_WINDOWS = 10
 STREAM_HAZARDS = 0.05
-# Thresholds are set on so many drawn streams: gamma then depends less on which windows one street is made of.
+# Thresholds are set on this many random streams, so that gamma depends less on the windows of one street.
 STREAMS = 5
 _WINDOW_S = 1.0
 
 
 def with_site_references(table: FeatureTable) -> FeatureTable:
-    """Append to each window the reference of its junction, from its other recordings; no label is looked at.
+    """Append to each window the reference of its junction from the other recordings; labels are not used.
 
     Shapes: table (n, 60), returns (n, 240).
     """
@@ -33,7 +33,7 @@ def with_site_references(table: FeatureTable) -> FeatureTable:
 
 
 def simulated_beside(tables: Sequence[FeatureTable]) -> SimulatedWindows:
-    """Return simulated windows as the ensemble learns them: those of a table compared with its own."""
+    """Return simulated windows for the ensemble: those of each table, compared with their own site."""
     parts = []
     for part in map(with_site_references, tables):
         weights, other_side = (np.full(len(part), value) for value in (SIMULATED_WEIGHT, OTHER_SIDE))
@@ -44,9 +44,9 @@ def simulated_beside(tables: Sequence[FeatureTable]) -> SimulatedWindows:
 def asked_while_listening(
     table: FeatureTable, rng: np.random.Generator
 ) -> Callable[[EnsembleModel, BoolArray], FloatArray]:
-    """Return posteriors of rows by a model that compares them with what `run` has learned before them.
+    """Return a function for the posteriors of rows, with references from a random stream before each.
 
-    Shapes: table (n, 60 or more): what is behind the first 60 features of a window is not looked at.
+    Shapes: table (n, 60 or more); only the first 60 features of a window are used.
     """
     windows = table.features[:, :N_FEATURES]
     learned = learned_while_listening(replace(table, features=windows), rng)
@@ -61,14 +61,15 @@ def asked_while_listening(
 def learned_while_listening(
     table: FeatureTable, rng: np.random.Generator, *, or_nothing: bool = False
 ) -> list[SiteEstimate]:
-    """Return for each window what `run` has learned of its junction from a stream before it.
+    """Return for each window the site estimate of its junction from a random stream before it.
 
-    Where no other recording has an empty window that is an error, or with `or_nothing` nothing was heard.
+    If no other recording has an empty window, an error is raised, or with `or_nothing` the initial estimate
+    is returned.
 
     Shapes: table (n, 60).
     """
-    # Labels compose the street, a twentieth of it hazards; the estimate sees none, and nothing of the
-    # recording that is scored: neither its windows nor its label move what is drawn for it.
+    # Labels select the windows of the street, one in twenty of them with a hazard. The estimate does not use
+    # labels, and neither the windows nor the label of the scored recording influence its stream.
     settings, start = SiteEstimateSettings(), SiteEstimate.start(table.features.shape[1])
     learned = [start] * len(table)
     for mine, others in _recordings(table):
@@ -89,20 +90,20 @@ def _stream(table: FeatureTable, others: BoolArray, rng: np.random.Generator) ->
         raise InvalidArgumentError(f"{site}: expected hazard-free windows to compose a stream of, got none")
     kind, which = rng.random((2, STREAM_WINDOWS))
     comes = (kind < STREAM_HAZARDS) & bool(hazards.size)
-    # Hazards first, so that a number in [0, 1) picks one of either.
+    # Hazards first, so that a number in [0, 1) selects one of each kind.
     rows = np.concatenate([hazards, empty])
     picked = np.where(comes, which * hazards.size, hazards.size + which * empty.size)
     return np.asarray(rows[picked.astype(np.intp)])
 
 
 def _recordings(table: FeatureTable) -> list[tuple[BoolArray, BoolArray]]:
-    """Windows of each recording, and those of the other recordings of its junction."""
+    """Return the windows of each recording, and those of the other recordings of its junction."""
     keys, parts = table.recording_keys, []
     for key in np.unique(keys):
         mine = keys == key
         others = (table.environments == table.environments[mine][0]) & ~mine
         if not others.any():
-            expected = "another recording of its junction, to compare it with"
+            expected = "another recording of its junction for comparison"
             raise InvalidArgumentError(f"recording {key}: expected {expected}")
         parts.append((mine, others))
     return parts

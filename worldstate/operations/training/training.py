@@ -1,7 +1,7 @@
 """Training of a model: classifier on all windows, thresholds and risk maps on out-of-fold scores.
 
-Folds keep a recording whole. Thresholds and risk maps are of single windows, one hazard-free window a
-recording.
+Folds do not split recordings. Thresholds and risk maps apply to single windows; each recording has one
+hazard-free window.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ from .site_references import STREAMS, asked_while_listening, learned_while_liste
 
 FitMap = Callable[[ArrayLike, ArrayLike], RiskMap]
 
-# The published statistic takes no account of vision; ours removes the visible explanation.
+# The published statistic ignores vision; ours removes the visible explanation.
 PUBLISHED_MISS_RATE = 1.0
 ABSENT_MISS_RATE = 0.0
 MISS_RATES = (PUBLISHED_MISS_RATE, ABSENT_MISS_RATE)
@@ -48,11 +48,11 @@ MISS_RATES = (PUBLISHED_MISS_RATE, ABSENT_MISS_RATE)
 
 @dataclass(frozen=True, slots=True)
 class WindowCalibration:
-    """What was learned on calibration windows and is applied unchanged to others."""
+    """Threshold and risk map learned on calibration windows and applied unchanged to others."""
 
-    miss_rate: float  # beta at which the statistic is formed
+    miss_rate: float  # beta of the statistic
     gamma: float  # Threshold
-    risk_map: RiskMap  # From statistic to risk
+    risk_map: RiskMap  # Maps the statistic to risk
 
     def apply(self, probabilities: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return statistic, risk and decision of each window from posteriors, shape (n, 4)."""
@@ -69,7 +69,7 @@ def calibrate_windows(
     miss_rate: float,
     fit_map: FitMap = fit_isotonic,
 ) -> WindowCalibration:
-    """Set threshold and risk map on posteriors of windows that the classifier was not trained on.
+    """Set threshold and risk map on posteriors of windows outside the training set of the classifier.
 
     Shapes: probabilities (n, 4), hazards, hazard_free (n,).
 
@@ -81,8 +81,8 @@ def calibrate_windows(
     >>> calibration.apply(posteriors)[2]
     array([ True, False, False])
     """
-    # The threshold is set for single windows. A sustained rule alarms on a part of those only, and so keeps
-    # the budget too.
+    # The threshold is set for single windows. A sustained rule raises an alarm for only some of them, so it
+    # also meets the budget.
     if not hazards.any() or not hazard_free.any():
         raise InvalidArgumentError("calibration: expected windows with and without a hazard")
     score = hazard_statistic(probabilities, miss_rate)
@@ -102,18 +102,18 @@ def calibrate_passes(
     miss_rate: float,
     fit_map: FitMap = fit_platt,
 ) -> WindowCalibration:
-    """Return one calibration of posteriors out of fold, from the most careful folds to the boldest.
+    """Return one calibration of out-of-fold posteriors, from the most conservative folds to the boldest.
 
-    Each level holds passes over the table, of shape (n, 4): one for each stream and cross-validation.
+    Each level contains passes over the table, shape (n, 4): one per stream and cross-validation.
     """
-    # A classifier at a junction that it never saw stands between two that can be measured on its training
-    # set: one that saw fewer junctions and not this one (leave one junction out), and one that saw this one
-    # too (leave recordings out). The first is too careful, the second too bold, so the threshold is taken
-    # half-way between them: as numbers, not in log-odds, where one empty window that a classifier of a single
-    # junction is sure of would carry the threshold away. That of a level is the mean of its passes': which
-    # ten windows a street is made of moves the few scores that gamma stands on. The risk map is that of the
-    # boldest: statistics of windows that are compared with their site mean the same elsewhere, those of a
-    # classifier from too few junctions do not.
+    # At an unknown junction, a classifier is between two cases that can be measured on the training set: one
+    # trained on fewer junctions without this one (leave one junction out), and one trained also on this one
+    # (leave recordings out). The first is too conservative and the second too bold, so the threshold is
+    # half-way between them. The mean is taken of the values, not of log-odds, in which one empty window with
+    # a confident classifier of a single junction would dominate. The threshold of a level is the mean over
+    # its passes, because the choice of the ten windows of a street changes the few scores that determine
+    # gamma. The risk map is that of the boldest level: statistics of windows that are compared with their
+    # site transfer to other sites, those of a classifier from too few junctions do not.
     if not levels or not all(levels):
         raise InvalidArgumentError("levels: expected at least one pass each")
     gammas = [
@@ -129,7 +129,7 @@ def calibrate_passes(
 
 
 def _gamma(score: FloatArray, alpha: float) -> float:
-    # No window has less than 0: where all may be in alarm, the least float would carry a mean away.
+    # No score is below 0; without this limit the least float of an unreachable budget would dominate a mean.
     return max(neyman_pearson_threshold(list(score[:, None]), alpha), 0.0)
 
 
@@ -139,7 +139,7 @@ Trained = TypeVar("Trained")
 
 
 def recording_labels(table: FeatureTable) -> dict[str, str]:
-    """Return the label of each recording: that of its hazard window where it has one besides ``front``."""
+    """Return the label of each recording: that of its hazard window, or ``front`` without one."""
     labels: dict[str, str] = {}
     for key, label in zip(table.recording_keys.tolist(), table.labels.tolist(), strict=True):
         if key not in labels or label != "front":
@@ -148,21 +148,21 @@ def recording_labels(table: FeatureTable) -> dict[str, str]:
 
 
 def folds_by_recording(table: FeatureTable, rng: np.random.Generator) -> TextArray:
-    """Deal recordings to folds so that each holds its share of every label at every junction."""
+    """Assign recordings to folds so that each fold has its share of every label at every junction."""
     labels = recording_labels(table)
     if len(labels) < N_FOLDS:
         raise InvalidArgumentError(f"expected at least {N_FOLDS} recordings to split, got {len(labels)}")
     strata: dict[tuple[str, str], list[str]] = {}
     for key, label in labels.items():
         strata.setdefault((key.split("/")[0], label), []).append(key)
-    # Dealing goes on where the last stratum stopped, or the first folds would collect every remainder.
+    # Each stratum continues at the next fold, so that the first folds do not collect every remainder.
     dealt = [key for stratum in sorted(strata) for key in rng.permutation(sorted(strata[stratum])).tolist()]
     fold_of = {key: str(position % N_FOLDS) for position, key in enumerate(dealt)}
     return np.array([fold_of[key] for key in table.recording_keys.tolist()])
 
 
 def junction_folds(table: FeatureTable) -> TextArray:
-    """Return the junction of each window: leave one junction out."""
+    """Return the junction of each window, as folds that leave one junction out."""
     if len(np.unique(table.environments)) < 2:
         raise InvalidArgumentError("expected at least two junctions to leave one out")
     return table.environments
@@ -174,9 +174,10 @@ def out_of_fold(
     fit: Callable[[FeatureTable], Trained],
     asks: Sequence[Callable[[Trained, BoolArray], FloatArray]],
 ) -> list[FloatArray]:
-    """Return posteriors of each window from a classifier trained on the other folds, for each way to ask.
+    """Return posteriors of each window from classifiers trained on the other folds, for each of `asks`.
 
-    Each of `asks` returns those of the chosen rows of `table`, shape (rows, 4); what comes back is (n, 4).
+    Each of `asks` returns the posteriors of the selected rows of `table`, shape (rows, 4); the results are
+    (n, 4).
     """
     passes = [np.empty((len(table), len(CLASSES))) for _ in asks]
     for fold in np.unique(folds):
@@ -190,31 +191,34 @@ def out_of_fold(
 def asked_on_streams(
     table: FeatureTable, rng: np.random.Generator
 ) -> list[Callable[[EnsembleModel, BoolArray], FloatArray]]:
-    """Return `asked_while_listening` on as many drawn streams as thresholds are set on."""
-    # On one drawn stream a standing ego had TPR .645 at .029 of false positives where a junction is left out,
-    # on five .660 at .025: which ten windows a street is made of moves single scores, and gamma is one.
+    """Return `asked_while_listening` for several random streams."""
+    # With one random stream, a standing ego at junctions left out had TPR 0.645 at a false-positive rate of
+    # 0.029, with five 0.660 at 0.025: the choice of a street's ten windows changes single scores, and gamma
+    # is one.
     return [asked_while_listening(table, one) for one in rng.spawn(STREAMS)]
 
 
-# Budgets.
+# Budgets of the policies.
 ALPHAS = (0.01, 0.02, 0.05)
 ENSEMBLE = "softmax regressions, all classes mirrored, windows compared as curated and as heard"
-# Draws what was heard before each window of a training set: the same for the same table.
+# Seed of the streams before the windows of a training set, so that the same table gives the same streams.
 _HEARD_SEED = 0
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingSettings:
-    """How a model is trained.
+    """Settings of the training.
 
     Parameters
     ----------
     seed : int
-        Of the generator that draws all folds.
+        Seed of the generator of all folds.
     repeats : int
-        Cross-validations whose out-of-fold scores are pooled: gamma(alpha) then depends less on the folds.
+        Number of cross-validations whose out-of-fold scores are pooled, so that gamma(alpha) depends less on
+        the folds.
     sustain_hops : int
-        k of the sustained rule. Single windows cannot tell it; the threshold keeps its budget at any k.
+        k of the sustained rule. It cannot be learned from single windows; the threshold meets its budget for
+        any k.
 
     Examples
     --------
@@ -228,7 +232,7 @@ class TrainingSettings:
 
     @property
     def steps(self) -> int:
-        """How often progress is reported."""
+        """Number of progress reports."""
         return self.repeats + 1
 
 
@@ -244,19 +248,19 @@ def train_model(
 ) -> Model:
     """Train the ensemble and calibrate its cueing.
 
-    The ensemble is mirror-symmetric and compares windows with their site. Thresholds lie half-way between
-    those of recordings left out and of junctions left out.
+    The ensemble is mirror-symmetric and compares windows with their site. Thresholds are half-way between
+    those for recordings left out and those for junctions left out.
 
     Parameters
     ----------
     table : FeatureTable
-        Windows; those to be left out are left out already.
+        Windows, without the excluded ones.
     settings : TrainingSettings
-        Seed, repeats, sustained rule.
+        Seed, repeats and sustained rule.
     dataset, group, excluded_lists : str, str, sequence of str
-        For the provenance.
+        Values for the provenance.
     simulated : SimulatedWindows, optional
-        Learned by the ensemble beside the table.
+        Additional training windows of the ensemble.
     on_step : callable
         Called after each cross-validation and after the last fit.
 
@@ -289,7 +293,7 @@ def train_model(
     rng, inputs = np.random.default_rng(settings.seed), with_site_references(table)
     fit = partial(fit_ensemble, simulated=simulated)
     levels = _out_of_fold_levels(inputs, fit, settings.repeats, rng, on_step)
-    # The ego's motion is that of the windows that are left in the table.
+    # The ego's motion is that of the remaining windows of the table.
     motion, domain = ego_motion_of(np.unique(table.environments).tolist()), table.domain
     signature = replace(fit(inputs), domain=None if domain is None else replace(domain, ego_motion=motion))
     on_step()
@@ -308,16 +312,16 @@ def train_model(
 
 
 def fit_ensemble(inputs: FeatureTable, simulated: SimulatedWindows | None = None) -> EnsembleModel:
-    """Fit the ensemble on windows with the references of their sites behind them."""
+    """Fit the ensemble on windows followed by the references of their sites."""
     return trained_ensemble(inputs, simulated).model_
 
 
 def trained_ensemble(
     inputs: FeatureTable, simulated: SimulatedWindows | None = None
 ) -> SiteEnsembleClassifier:
-    """Return the classifier of `fit_ensemble`: its recipes are those of the ego's motion.
+    """Return the classifier of `fit_ensemble`, with the recipes for the ego's motion.
 
-    Each window is compared with its junction's other windows and with a stream that `run` heard before it.
+    Each window is compared with the other windows of its junction and with a random stream before it.
     """
     windows = replace(inputs, features=inputs.features[:, :N_FEATURES])
     heard = learned_while_listening(windows, np.random.default_rng(_HEARD_SEED), or_nothing=True)
@@ -347,10 +351,10 @@ def _out_of_fold_levels(
     rng: np.random.Generator,
     on_step: Callable[[], None],
 ) -> list[list[FloatArray]]:
-    """Posteriors of windows not trained on, level by level as `calibrate_passes` has them."""
-    # Windows compared as `run` has them: thresholds from curated references gave a standing ego .055 of
-    # false positives in place of .030 at TPR .83 for .80, a moving one TPR .44 for .50. Generators of
-    # their own: what is drawn to ask moves no fold.
+    """Return posteriors of windows outside the training folds, in the levels of `calibrate_passes`."""
+    # Windows are compared as in `run`. Thresholds from curated references gave a standing ego a
+    # false-positive rate of 0.055 (instead of 0.030) at TPR 0.83 (0.80), and a moving one TPR 0.44 (0.50).
+    # The streams have their own generators, so that they do not change the folds.
     asks = asked_on_streams(inputs, rng)
     passes = []
     for _ in range(repeats):
@@ -372,7 +376,7 @@ def _policies(
 
 
 def _figures(table: FeatureTable, passes: list[FloatArray], repeats: int) -> dict[str, float]:
-    """Out-of-fold figures, mean over the repeats and streams."""
+    """Return out-of-fold figures, averaged over repeats and streams."""
     scored, classes = table.hazards | table.hazard_free, np.array(CLASSES)
 
     def area(miss_rate: float) -> float:
