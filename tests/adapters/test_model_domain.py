@@ -484,7 +484,7 @@ def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
     assert main(["model", "threshold", str(streams), "--model", str(tmp_path / "own.json"), *words]) == 0
     out.unlink()
     assert main(["model", "threshold", str(streams), *words]) == 2
-    assert "heard with another model's signature" in capsys.readouterr().err and not out.exists()
+    assert "made with another model's signature" in capsys.readouterr().err and not out.exists()
 
 
 def test_evaluate_refuses_a_model_of_another_array(

@@ -121,7 +121,7 @@ def test_approaches_with_a_t0_give_the_risk_map():
 def test_too_few_hours_are_said_with_what_it_would_take():
     few = [street(np.random.default_rng(2)) for _ in range(5)]
     done = calibrate_cueing(few, PRIOR, read_model().policies, CueingSettings(alphas=(0.01,)))
-    assert any("h would tell it to a factor of two" in warning for warning in done.warnings)
+    assert any("h would determine it to a factor of two" in warning for warning in done.warnings)
     assert any(warning.startswith("5 recordings") for warning in done.warnings)
     with pytest.raises(InvalidArgumentError, match="without a hazard"):
         calibrate_cueing([street(np.random.default_rng(2), "left")], PRIOR, read_model().policies)

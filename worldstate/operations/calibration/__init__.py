@@ -1,1 +1,1 @@
-"""Thresholds and risk maps from recordings without hazards."""
+"""Thresholds and risk maps from hazard-free recordings."""

@@ -1,6 +1,6 @@
-"""Thresholds and risk maps from whole recordings: what `worldstate model threshold` does.
+"""Thresholds and risk maps from whole recordings, for `worldstate model threshold`.
 
-They come from data sets, recordings, sound files or hop streams that were saved.
+The inputs are data sets, recordings, sound files or saved hop streams.
 """
 
 import itertools
@@ -35,15 +35,15 @@ from worldstate.operations.recordings.hop_table import (
 )
 from worldstate.operations.training.training import MISS_RATES
 
-# Of the recording-level folds that the achieved rate is measured by.
+# Number of recording-level folds for the achieved rate.
 N_FOLDS = 5
-# With fewer false alarms in all the hours than this, their rate is not known to a factor of two.
+# With fewer false alarms in total, their rate is uncertain by more than a factor of two.
 ENOUGH_ONSETS = 10
 
 
 @dataclass(frozen=True, slots=True)
 class CueingSettings:
-    """How thresholds are set.
+    """Settings of the thresholds.
 
     Parameters
     ----------
@@ -73,25 +73,25 @@ class CueingSettings:
             in_range("alpha", alpha, 0.0, 1.0, open_low=True, open_high=True)
 
     def threshold(self, hazard_free: Sequence[FloatArray], alpha: float) -> float:
-        """Return gamma(alpha) on recordings."""
+        """Return gamma(alpha) for hazard-free recordings."""
         return neyman_pearson_threshold(hazard_free, alpha, self.sustain_hops)
 
 
 @dataclass(frozen=True, slots=True)
 class BudgetReport:
-    """What one budget came to."""
+    """Results for one budget."""
 
-    alpha: float  # The budget, and the beta of the statistic
-    miss_rate: float
+    alpha: float  # The budget
+    miss_rate: float  # beta of the statistic
     gamma: float  # The threshold
-    counted: ApproachTable  # Its false alarms on the recordings that it was set on
-    # Share of windows in alarm by recording-level folds: set on the others, counted on each. None with a
+    counted: ApproachTable  # False alarms on the recordings for which it was set
+    # Share of windows in alarm over recording-level folds, with thresholds from the other folds. None with a
     # single recording.
     held_out_rate: float | None
-    held_out_per_hour: float | None  # False alarms per hour by the same folds
+    held_out_per_hour: float | None  # False alarms per hour over the same folds
 
     def to_dict(self) -> dict[str, object]:
-        """Return JSON-able values."""
+        """Return values for JSON."""
         rates = self.counted.false_alarms()
         return {
             "alpha": self.alpha,
@@ -108,22 +108,22 @@ class BudgetReport:
 
 @dataclass(frozen=True, slots=True)
 class CueingCalibration:
-    """Policies, and how far they can be relied on.
+    """Policies, with their achieved rates and reliability.
 
     Parameters
     ----------
     policies : CueingPolicies
-        One for each budget and miss rate.
+        One per budget and miss rate.
     budgets : tuple of BudgetReport
-        In the same order.
+        Results in the same order.
     hours, windows, recordings : float and int
-        Hazard-free time, decision windows and recordings.
+        Hours, number of decision windows and number of recordings without hazards.
     correlation_time_s : float
-        Of the statistic at miss rate 0.
+        Correlation time of the statistic at miss rate 0.
     risk : {"kept", "platt", "isotonic"}
-        Where the risk map comes from.
+        Origin of the risk map.
     warnings : tuple of str
-        What the hours do not suffice for.
+        Figures for which there are too few hours.
 
     Examples
     --------
@@ -150,23 +150,23 @@ def calibrate_cueing(
     kept: CueingPolicies,
     settings: CueingSettings | None = None,
 ) -> CueingCalibration:
-    """Set gamma(alpha) on hazard-free recordings, and the risk map where approaches with a T0 are there too.
+    """Set gamma(alpha) on hazard-free recordings, and the risk map if there are approaches with a T0.
 
     Parameters
     ----------
     streams : sequence of HopTable
-        Hazard-free recordings, and approaches if there are any.
+        Hazard-free recordings, and optionally approaches.
     reference_prior : tuple of float
-        Prior that the statistic is formed at: the signature model's own.
+        Prior of the statistic, which is that of the signature model.
     kept : CueingPolicies
-        Whose risk maps are kept where no approach is there to fit one to.
+        Policies whose risk maps are kept if there are no approaches.
     settings : CueingSettings, optional
-        Budgets and the sustained rule.
+        Budgets and sustained rule.
 
     Returns
     -------
     CueingCalibration
-        Policies, with what was achieved on other folds.
+        Policies with the rates achieved on other folds.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def calibrate_cueing(
 
     Examples
     --------
-    Ten hazard-free recordings of a minute, made up:
+    Ten artificial hazard-free recordings of one minute:
 
     >>> from worldstate.adapters.files.model_file import read_model
     >>> rng, kept = np.random.default_rng(0), read_model().policies
@@ -214,7 +214,7 @@ def _by_miss_rate(
     kept: CueingPolicies,
     settings: CueingSettings,
 ) -> tuple[list[BudgetReport], list[CueingPolicy]]:
-    """Return a report and a policy for every miss rate and budget."""
+    """Return a report and a policy per miss rate and budget."""
     budgets, policies = list[BudgetReport](), list[CueingPolicy]()
     for beta in sorted(MISS_RATES):
         calm = [statistic_at(stream, prior, beta) for stream in free]
@@ -229,12 +229,12 @@ def _by_miss_rate(
 
 
 def statistic_at(stream: HopTable, prior: Sequence[float], miss_rate: float) -> FloatArray:
-    r"""Return the statistic of every hop with absence at a fixed miss rate, shape (n,).
+    r"""Return the statistic of every hop with an absence of a fixed miss rate, shape (n,).
 
     .. math:: s = \frac{\sum_k \pi_k \ell_k}
               {\sum_k \pi_k \ell_k + \beta\, \pi_{vis} \ell_{vis} + \pi_0 \ell_0}
 
-    It is `abduction.posterior.statistic` with the same answer at every hop.
+    It is `abduction.posterior.statistic` with the same co-evidence at every hop.
 
     Shapes: prior (K + 2,).
     """
@@ -252,7 +252,7 @@ def _counted(calm: Sequence[FloatArray], gamma: float, settings: CueingSettings)
 def _held_out(
     calm: list[FloatArray], alpha: float, settings: CueingSettings
 ) -> tuple[float, float] | tuple[None, None]:
-    """Achieved rates by folds that never part a recording."""
+    """Return the rates achieved over folds that do not split recordings."""
     folds = min(N_FOLDS, len(calm))
     if folds < 2:
         return None, None
@@ -283,31 +283,31 @@ def _warnings(budgets: list[BudgetReport], recordings: int) -> Iterator[str]:
             yield (
                 f"alpha {report.alpha:g}: {count.onsets} false alarms in {count.hours:.3g} h put their rate "
                 f"between {low:.3g} and {high:.3g} an hour; "
-                f"{enough_h:.2g} h would tell it to a factor of two"
+                f"{enough_h:.2g} h would determine it to a factor of two"
             )
 
 
 def hop_streams(corpus: Path) -> Iterator[HopTable]:
-    """Yield the hop streams of a corpus, every recording as hazard-free, with the levels of the alarm.
+    """Yield the hop streams of a corpus with the levels of the alarm; each recording is taken as hazard-free.
 
     Raises
     ------
     InputFileError
-        If `hear` wrote no hops of it.
+        If the corpus has no table of hops.
     """
     names = [name for name in (*STREAM_COLUMNS, "level_left", "level_right") if name != "there"]
     rows, about_of = corpus_rows(corpus, HeardHop), attrgetter("recording", "site", "signature")
     for (name, site, signature), hops in itertools.groupby(rows, key=about_of):
         columns = zip(*map(attrgetter(*names), hops), strict=True)
         table = dict(zip(names, map(np.array, columns), strict=True))
-        # Of a hop without a level the column holds None.
+        # A hop without a level has None in this column.
         levels = {side: table[side].astype(float) for side in names[-2:]}
         about = {"site": site, "signature": signature}
         yield HopTable(table | levels | {"there": table["seen"]}, name=name, about=about)
 
 
 def find_inputs(path: Path) -> list[Path]:
-    """Return the recordings of a data set, or the file or recording folder itself."""
+    """Return the recordings of a data set, or the given file or recording folder."""
     if not path.exists():
         raise InputFileError(path, "expected a data set, a recording folder or a sound file")
     if path.is_dir() and (path / LOG_NAME).is_file():
@@ -318,16 +318,16 @@ def find_inputs(path: Path) -> list[Path]:
 def read_input(
     path: Path, *, array: MicrophoneArray | None = None, model: Path | None = None
 ) -> list[HopTable]:
-    """Listen to a recording or read streams; a sound file counts as hazard-free."""
+    """Process a recording or read streams; a sound file is taken as hazard-free."""
     chosen = read_model(model, array=array)
-    # What was heard are this signature's scores: another one's thresholds cannot be set on them.
+    # Scores belong to one signature; thresholds of another signature cannot be set on them.
     about = {"signature": signature_checksum(chosen.signature)}
     if path.suffix == ".npz" or (path / "hops").is_dir():
         streams = load_streams(path) if path.is_file() else list(hop_streams(path))
         if not streams:
             raise InputFileError(path, "expected hops of sound: `worldstate hear --hops` writes them")
         if any(stream.about.get("signature", about["signature"]) != about["signature"] for stream in streams):
-            raise OutOfDomainError(f"{path}: heard with another model's signature; listen to the sound again")
+            raise OutOfDomainError(f"{path}: made with another model's signature; process the sound again")
         return streams
     source = open_source(path, array=array, model=chosen)
     measured = (measurement for _, measurement in measure_steps(source))
@@ -350,8 +350,8 @@ def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
     ----------
     Geyer, "Practical Markov chain Monte Carlo", 1992.
     """
-    # summed while the sums of neighbouring pairs are positive (Geyer's initial positive sequence). N windows
-    # tell as much of the mean as N / tau independent ones.
+    # The sum ends at the first pair of neighbouring terms that is not positive (Geyer's initial positive
+    # sequence). N windows determine the mean as well as N / tau independent ones.
     values = [finite_array("streams", stream, (None,)) for stream in streams]
     if not sum(value.size for value in values):
         raise InvalidArgumentError("streams: expected at least one window")
@@ -363,7 +363,7 @@ def correlation_time_hops(streams: Sequence[ArrayLike]) -> float:
 
 
 def _autocorrelation(values: list[FloatArray]) -> FloatArray:
-    """Pooled autocorrelation up to half the longest stream, lag 0 first."""
+    """Return the pooled autocorrelation up to half the longest stream, from lag 0."""
     mean = np.concatenate(values).mean()
     lags = max(value.size for value in values) // 2 + 2
     total, counts = np.zeros(lags), np.zeros(lags)
