@@ -1,1 +1,1 @@
-"""How often a camera's detector misses what is there."""
+"""Measurement of the miss rates of a camera's detector."""

@@ -1,4 +1,4 @@
-"""Miss rates of a camera's detector, measured by re-detection on degraded frames, and their figure."""
+"""Miss rates of a camera's detector, measured on degraded frames with reference boxes, and their figure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -33,36 +33,36 @@ from worldstate.operations.figure_style import SEARCHED, figure_file, legend_bes
 
 MakeDetector = Callable[[], Detector]
 
-# Inner edges of the bins of azimuth off the optical axis; they run from 0 to the edge of the view.
+# Inner edges of the azimuth bins off the optical axis, which extend from 0 to the edge of the view.
 _BINS_DEG = (10.0, 20.0, 30.0)
-# IoU from which on a reference box counts as found.
+# Least IoU at which a reference box counts as found.
 MIN_OVERLAP = 0.3
-# Half the width of a query sector, in which clutter is counted, and how far apart the sectors lie.
+# Half the width of a query sector for clutter, and distance between the sectors.
 _HALF_WIDTH_RAD, _SECTOR_STEP_RAD = float(np.radians(10.0)), np.radians(5.0)
-# Clean frames that the scale of health is learned from, spread over the videos.
+# Number of clean frames for the health scale, spread over the videos.
 _HEALTH_FRAMES = 10
-# First frames of each video that count for nothing: motion detectors learn the background in them.
+# Initial frames of each video that are ignored, because motion detectors learn the background in them.
 _WARM_UP = 10
-# Frames that say the same: at ten a second and a look every 0.3 s, three.
+# Number of frames with the same information: three, at 10 per second and an independent look every 0.3 s.
 REPEATS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class AbsenceSettings:
-    """How misses are counted.
+    """Settings for the counts of misses.
 
     Parameters
     ----------
     families : tuple of str
-        What is staged.
+        Degradations that are simulated.
     keep : DetectionFilter
-        Which reference boxes count. Parked ones do not: they are no co-evidence, and no motion detector
-        sees them.
+        Filter of the reference boxes. Parked objects are not counted, because they are no co-evidence, and
+        motion detectors do not find them.
 
     Raises
     ------
     InvalidArgumentError
-        If a family is not known.
+        If a family is unknown.
 
     Examples
     --------
@@ -80,18 +80,18 @@ class AbsenceSettings:
             raise InvalidArgumentError(f"families: expected some of {', '.join(FAMILIES)}")
 
     def edges_deg(self, camera: PinholeCamera) -> tuple[float, ...]:
-        """Return the bin edges of a camera; the last one lies a degree outside its view."""
+        """Return the bin edges of a camera; the last one is 1 degree outside its view."""
         edge = float(np.degrees(np.abs(camera.off_axis(camera.view_rad)).max())) + 1.0
         return (0.0, *(deg for deg in _BINS_DEG if 0.0 < deg < edge - 2.0), edge)
 
 
 @dataclass(frozen=True, slots=True)
 class LabelledVideo:
-    """A video with what is known to be in it."""
+    """A video with reference detections."""
 
     video: Video  # Clean frames
-    reference: DetectionLog  # What is there, one entry a frame
-    camera: PinholeCamera  # That took it
+    reference: DetectionLog  # Reference objects, one entry per frame
+    camera: PinholeCamera  # Camera of the video
 
 
 def measure_absence(
@@ -103,42 +103,42 @@ def measure_absence(
     provenance: dict[str, str] | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> MissRates:
-    r"""Count how often reference boxes are found again on degraded frames.
+    r"""Measure how often reference boxes are found again on degraded frames.
 
-    A reference box is found where a detection has :math:`IoU \ge 0.3` with it. A detection that has this with
-    no reference box, and whose middle lies in none, is false; a query sector without a reference object that
-    a false one reaches into counts as clutter.
+    A reference box is found if a detection has :math:`IoU \ge 0.3` with it. A detection is false if it has a
+    smaller IoU with all reference boxes and its middle is in none of them. A query sector without a reference
+    object has clutter if a false detection overlaps it.
 
     Parameters
     ----------
     scenes : sequence of LabelledVideo
         Videos of one camera.
     make_detector : callable
-        Makes a detector; it may have a state, so each video at each level gets a new one.
+        Creates a detector. Detectors may have a state, so each video gets a new one at each level.
     rng : numpy.random.Generator
-        Draws the staged noise.
+        Generates the simulated noise.
     settings : AbsenceSettings, optional
-        How it is counted.
+        Settings of the counts.
     provenance : dict of str, optional
-        Written into the file.
+        Metadata for the file.
     on_frame : callable
-        Called after each frame of each video, all levels of all families done.
+        Called after each frame of each video, when all levels of all families are done.
 
     Returns
     -------
     MissRates
-        Counts for each family, azimuth bin and level.
+        Counts per family, azimuth bin and level.
 
     Raises
     ------
     InvalidArgumentError
-        If there is no scene.
+        If there are no scenes.
     InputFileError
         If no reference object is ever in view.
 
     Examples
     --------
-    Twenty images of a white box that moves on black, and a detector that finds what is bright:
+    Twenty images of a white box that moves on black, and a detector that finds bright regions:
 
     >>> from types import SimpleNamespace
     >>> images = np.zeros((20, 120, 160, 3), np.uint8)
@@ -177,7 +177,7 @@ def measure_absence(
 
 
 class AbsenceTally:
-    """Counts of looks and misses, family by family, of what a detector found on staged frames."""
+    """Counts of looks and misses per family, from detections on degraded frames."""
 
     def __init__(self, camera: PinholeCamera, settings: AbsenceSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -189,13 +189,13 @@ class AbsenceTally:
 
     @property
     def looks(self) -> float:
-        """Reference objects on clean frames."""
+        """Number of reference objects on clean frames."""
         return float(self._looks[0, :, 0].sum())
 
     def count(
         self, reference: DetectionLog, number: int, found: DetectionFrame, family: Family, level: int
     ) -> None:
-        """Count what was found in a frame at a level; level 0 is the clean frame of every family."""
+        """Add the detections in a frame at a level; level 0 is the clean frame of every family."""
         if not _WARM_UP <= number < len(reference):
             return
         families = slice(None) if level == 0 else self._settings.families.index(family)
@@ -214,7 +214,7 @@ class AbsenceTally:
         self._clutter[families, level] += sum(touched)
 
     def counts(self) -> dict[str, FamilyCounts]:
-        """Return the counts so far by family."""
+        """Return the current counts per family."""
         every = zip(self._looks, self._misses, self._sectors, self._clutter, strict=True)
         return {
             family: FamilyCounts(*map(as_tuples, counted))
@@ -222,14 +222,14 @@ class AbsenceTally:
         }
 
     def _bins(self, boxes_px: FloatArray) -> IntArray:
-        """Return the bin of azimuth off the optical axis of the middle of each box, shape (n,)."""
+        """Return the azimuth bin, off the optical axis, of the middle of each box, shape (n,)."""
         azimuths = self._camera.azimuth((boxes_px[:, 0] + boxes_px[:, 2]) / 2.0)
         off_axis_deg = np.degrees(np.abs(self._camera.off_axis(azimuths)))
         found = np.searchsorted(self.edges_deg, off_axis_deg, side="right") - 1
         return np.asarray(np.clip(found, 0, len(self.edges_deg) - 2))
 
     def _empty_sectors(self, there_px: FloatArray, false_px: FloatArray) -> list[bool]:
-        """Return of every sector without a reference object whether a false detection touches it."""
+        """Return for every sector without a reference object whether a false detection overlaps it."""
         half, (right, left) = _HALF_WIDTH_RAD, self._camera.view_rad
         centres = np.arange(right + half, left - half + 1e-9, _SECTOR_STEP_RAD)
         sectors = [Sector(float(centre), half) for centre in centres]
@@ -241,14 +241,14 @@ class AbsenceTally:
 
 
 def _inside(boxes_px: FloatArray, others_px: FloatArray) -> BoolArray:
-    """Whether the middle of each box lies in some other one, shape (n,)."""
+    """Return whether the middle of each box is in any of the other boxes, shape (n,)."""
     middles = (boxes_px[:, None, :2] + boxes_px[:, None, 2:]) / 2.0
     held = (middles >= others_px[None, :, :2]) & (middles <= others_px[None, :, 2:])
     return np.asarray(np.any(np.all(held, axis=2), axis=1))
 
 
 def _health(scenes: Sequence[LabelledVideo], rng: np.random.Generator) -> CameraHealth | None:
-    """Learn from frames spread over the videos; None where none of them shows anything sharp."""
+    """Learn the health scale from frames spread over the videos; None if no frame is sharp enough."""
     frames = []
     for scene in scenes[:_HEALTH_FRAMES]:
         wanted = max(_HEALTH_FRAMES // len(scenes), 1)
@@ -262,15 +262,15 @@ def _health(scenes: Sequence[LabelledVideo], rng: np.random.Generator) -> Camera
 
 
 def reference_by(detector: Detector, video: Video) -> DetectionLog:
-    """Return what a detector reports on clean frames: the reference where there is no other."""
-    # Its miss rate on clean frames is then zero by definition: only the degraded ones tell anything.
+    """Return the detections on clean frames, as the reference if there is no other."""
+    # The miss rate on clean frames is then zero by definition; only degraded frames are informative.
     found = [detector.detect(frame) for frame in video.frames()]
     return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
 
 
 def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | None]]:
-    """Return videos with the files of their reference boxes, None for a video that stands alone."""
-    # Of a data set the recordings with a vehicle count that have both.
+    """Return videos with the files of their reference boxes, None for a video without one."""
+    # In a data set, the recordings with a vehicle and with both files are used.
     if path.is_file():
         return [(path, None)]
     if not path.is_dir():
@@ -292,7 +292,7 @@ def _of_recording(recording: Recording) -> tuple[Path, Path | None]:
 
 
 def write_absence_figure(rates: MissRates, path: Path) -> None:
-    """Draw `rates` and write the figure as PNG, SVG or PDF, by the ending of `path`."""
+    """Draw `rates` as PNG, SVG or PDF, by the suffix of `path`."""
     names = list(rates.families)
     with figure_file(path, 3.0 * len(names) + 1.0, 3.2) as figure:
         panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
@@ -300,7 +300,7 @@ def write_absence_figure(rates: MissRates, path: Path) -> None:
             counts = rates.families[name]
             beta, (low, high) = counts.miss_rates(rates.repeats), counts.interval(rates.repeats)
             for i, row in enumerate(beta):
-                # Paler off the axis: all are looks.
+                # Bins farther off the axis are paler; all have the colour of looks.
                 shade = 1.0 - 0.75 * i / max(len(beta) - 1, 1)
                 label = f"{rates.azimuth_deg[i]:.0f}-{rates.azimuth_deg[i + 1]:.0f}°"
                 axes.plot(LEVELS, row, marker="os^Dv"[i % 5], color=SEARCHED, alpha=shade, label=label)
