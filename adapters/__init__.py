@@ -1,4 +1,4 @@
-"""Adapters: everything that touches a file, a camera, a data set, a bus or a clock."""
+"""Adapters for files, cameras, data sets, buses and clocks."""
 
 import lazy_loader
 

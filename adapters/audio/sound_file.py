@@ -296,7 +296,7 @@ def _open_plain(path: Path) -> PlainSamples | None:
         problem = f"cut short: expected {numbers[0]} bytes of samples by its header, got {plain.there_bytes}"
         raise InputFileError(path, f"{problem}; `sox --ignore-length IN OUT` keeps the existing samples")
     if plain.needed and numbers[0] != numbers[1]:
-        told = "%s: its header promises %d bytes of samples, the file holds %d: read to their end"
+        told = "%s: its header states %d bytes of samples, but the file has %d: all of them are read"
         _LOG.warning(told, path, *numbers)
     return plain if plain.needed else None
 
@@ -313,7 +313,7 @@ def _cut_short(path: Path, frames: int) -> InputFileError:
 def check_finite(path: Path, block: Float32Array, start: int) -> None:
     """Refuse NaN and infinity, and warn of overflow; `start` is the number of the block's first sample."""
     if start == 0 and (most := float(np.abs(block).max(initial=0.0))) > _OVER_FULL_SCALE:
-        _LOG.warning("%s: samples reach %.3g, beyond the full scale of 1: divide them by theirs", path, most)
+        _LOG.warning("%s: samples reach %.3g, beyond the full scale of 1: rescale them to it", path, most)
     finite = np.isfinite(block)
     if not finite.all():
         sample, channel = np.argwhere(~finite)[0]
@@ -407,7 +407,7 @@ def check_encoding(name: str, data: bytes, stated: Encoding, channels: int) -> N
     if form not in (None, stated):
         raise InputFileError(name, f"expected samples of {stated}, got samples like those of {form}")
     if padded:
-        told = "%s: samples of s32 fill 24 of 32 bits; if they are 24 bits in four bytes, name s24_32"
+        told = "%s: samples of s32 fill 24 of 32 bits; if they are 24 bits in four bytes, use s24_32"
         _LOG.warning(told, name)
 
 
@@ -548,8 +548,9 @@ def open_sound(
     expect_channels : int, optional
         Required number of channels: the microphones of the array.
     channels : sequence of int, optional
-        `MicrophoneArray.channels`, if there are other channels. A recording that has as many channels but not
-        all of these numbers is used unchanged, because they were selected when it was made.
+        `MicrophoneArray.channels`, to select the microphones if there are other channels. A recording with
+        exactly as many channels that lacks some of these numbers contains only the microphones, and is used
+        unchanged.
     strict : bool
         As for `open_audio`.
 

@@ -461,7 +461,7 @@ class SeveralCameras:
     .. math:: \beta = \sum_P s(P) \prod_{i \in c(P)} \beta_i(P)
 
     which contributes s(P) for a part in view of no camera. Given the position of the vehicle, misses of the
-    cameras are independent. A common cause such as rain must be part of each camera's miss rate, through its
+    cameras are taken as independent. A common cause such as rain must be in each camera's miss rate, by its
     degradation.
 
     Parameters

@@ -127,7 +127,7 @@ def feature_order(
     order = check_array(domain, array, way_out)
     if (np.diff(order) == 1).all():
         return None
-    _LOG.warning("%s: the model's microphones in another order; channels are put in the model's", array.name)
+    _LOG.warning("%s: its microphones are in another order than the model's and are reordered", array.name)
     return tuple(order.tolist())
 
 

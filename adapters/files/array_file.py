@@ -28,7 +28,7 @@ from .file_io import read_bytes, write_text
 
 _LOG = logging.getLogger(__name__)
 DATA = Path(str(files("worldstate"))) / "data"
-MODELS, PACKED = DATA / "models", ".json.gz"  # Beside the two models of the roof array
+MODELS, PACKED = DATA / "models", ".json.gz"  # Further models; `DATA` contains two for the roof array
 
 Axes = Literal["acoular", "base_link"]
 # The coordinates x, y and z of a microphone, before conversion to numbers.
@@ -278,7 +278,7 @@ def _xml_rows(path: Path, data: bytes) -> list[Row]:
         problem = "expected plain XML, got a document type or entities, which are refused"
         raise InputFileError(path, problem) from error
     except (SafeElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputFileError(path, f"expected array XML, it does not parse: {error}") from error
+        raise InputFileError(path, f"expected array XML, but it does not parse: {error}") from error
     found = [one for one in root.iter() if str(one.tag).rpartition("}")[2] == "pos"]  # in any namespace
     order = by_number(path, [element.get("Name", "") for element in found])
     return [[found[place].get(axis) for axis in "xyz"] for place in order]
@@ -332,7 +332,7 @@ def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]
     if len(counts) == 1:
         return [i for i in range(4) if i != counts[0]], counts[0], None
     way_on = "a header x,y,z,gain states what they are"
-    problem = f"expected x, y and z, got {len(cells[0])} numbers a line: {way_on}"
+    problem = f"expected x, y and z, got {len(cells[0])} numbers per line: {way_on}"
     raise InputFileError(path, f"{problem}; {_TRANSPOSED}" if len(cells) == 3 else problem)
 
 
@@ -351,7 +351,7 @@ def _json_rows(path: Path, data: bytes) -> _Rows:
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise InputFileError(path, f"expected array JSON, it does not parse: {error}") from error
+        raise InputFileError(path, f"expected array JSON, but it does not parse: {error}") from error
     held = document if isinstance(document, dict) else {"positions_m": document}
     stated = [unit for unit in _UNITS_M if f"positions_{unit}" in held]
     if len(stated) > 1 or {"unit", "units"} & {*held}:

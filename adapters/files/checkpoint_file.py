@@ -74,7 +74,7 @@ class Checkpoint:
         Raises
         ------
         SchemaVersionError
-            If the schema or its major version is another.
+            If the schema or its major version differs.
         InvalidArgumentError
             If a value is missing, of the wrong type or out of range; the message contains its place.
         """

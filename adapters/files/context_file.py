@@ -119,5 +119,5 @@ def read_context(path: str | Path) -> Context:
     with refused_as_file(path):
         record = read_record(_ContextFile, path, "context", by_hand=True)
         if record == _ContextFile():
-            _LOG.warning("%s: nothing in it, a usual blind junction is assumed", path)
+            _LOG.warning("%s: it is empty, so a usual blind junction is assumed", path)
         return record.context()

@@ -110,7 +110,7 @@ def write_rows(
         writer.writerows(rows)
 
 
-_GONE = "expected the file that was begun, it was moved or removed"
+_GONE = "expected the file of this run, but it was moved or removed"
 FileOpener: TypeAlias = Callable[[Path], "AbstractContextManager[BinaryIO | GrowingFile]"]
 
 
@@ -488,7 +488,7 @@ def in_order(stamps_ns: Sequence[int], source: str) -> list[int]:
     last = {stamp_ns: place for place, stamp_ns in enumerate(stamps_ns)}
     late = sum(b < a for a, b in itertools.pairwise(stamps_ns))
     if late or len(last) < len(stamps_ns):
-        told = "%s: %d stamps came after later ones and are sorted, %d came again, of which the last counts"
+        told = "%s: %d stamps were late and are sorted; of %d repeated stamps only the last one is used"
         _LOG.warning(told, source, late, len(stamps_ns) - len(last))
     return [last[stamp_ns] for stamp_ns in sorted(last)]
 

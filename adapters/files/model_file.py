@@ -205,7 +205,7 @@ def read_model(
     moving_ego : bool
         Use the roof-array model for a moving ego instead of the one for a standing ego.
     array : MicrophoneArray, optional
-        Array of the recording. If a model ships for a board with these microphones, it is read.
+        Array of the recording. The shipped model for a board with these microphones is read, if there is one.
 
     Returns
     -------
@@ -234,7 +234,7 @@ def read_model(
                     raise InvalidArgumentError(f"{name}: expected numbers up to {LARGEST:g}, got {most:g}")
         return model
     shipped = _shipped(file)
-    # Copied because only these parts are mutable.
+    # Only these parts are mutable, so they are copied.
     origin = shipped.provenance
     own = replace(origin, figures=dict(origin.figures), exam=dict(origin.exam))
     return replace(shipped, provenance=own, street=StreetModel())

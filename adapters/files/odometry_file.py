@@ -77,7 +77,9 @@ class OdometryRecord:
 
 
 def read_odometry(path: Path | str) -> OdometryLog:
-    r"""Read CSV with time_s, speed_mps; optional are yaw_rate_rad_s, and x_m, y_m, yaw_rad in the map.
+    r"""Read a CSV file of odometry with the columns time_s and speed_mps.
+
+    Optional columns are yaw_rate_rad_s, and the pose x_m, y_m, yaw_rad in the map.
 
     Lines are sorted by time, and the last one of equal times is used. An optional cell may be empty.
 
@@ -106,7 +108,7 @@ def read_odometry(path: Path | str) -> OdometryLog:
     with refused_as_file(name):
         log = OdometryLog.in_order(told, str(name))
     for column, unit in _other_units(log, turned_rad):
-        _LOG.warning("%s: %s has numbers such as of %s, which are read as they stand", name, column, unit)
+        _LOG.warning("%s: %s has numbers like those in %s; they are read unchanged", name, column, unit)
     return log
 
 

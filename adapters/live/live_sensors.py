@@ -47,7 +47,7 @@ _OLDEST_S = 1e-9 * LAG_NS
 # Allowed difference between the clocks of a sensor and of its sender; a capture slightly in the future is
 # taken as now.
 _AHEAD_S = 0.05
-# After this silence a sender has ended, and another one may replace it.
+# A sender that is silent for this long is taken as stopped, and another one may replace it.
 PINNED_S = 10.0
 
 
@@ -253,7 +253,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
             raise InvalidArgumentError(f"port: expected {self.name!r}, got {port!r:.60}")
         late_s = time.time() - decode(float, sent_s, "sent_s")
         if abs(late_s) > CLOCKS_APART_S:
-            problem = f"expected the time within {CLOCKS_APART_S:g} s, got one {late_s:.3f} s ago"
+            problem = f"expected a time within {CLOCKS_APART_S:g} s of now, got one {late_s:.3f} s ago"
             raise InvalidArgumentError(f"sent_s: {problem}")
 
     def _read(self) -> None:

@@ -564,7 +564,7 @@ class Playback:
                 if self._stopped.wait(max(due_s - time.monotonic(), 0.0)):
                     break
                 into.put(SoundBlock(samples, sent - len(samples), due_s))
-        except Exception as failure:  # raised where the blocks are taken
+        except Exception as failure:  # raised in the thread that takes the blocks
             error = failure
         into.close(error)
 

@@ -275,7 +275,7 @@ class BagAudio(sound_file.Audio):
 
 
 def _lost_bytes(packet: AudioPacket, lost_ns: float, within: bool) -> int:
-    """Return the number of bytes of a loss: whole samples, or whole messages if these split samples."""
+    """Return the size of a loss in bytes: whole samples, or whole messages if messages split samples."""
     whole = packet.pcm.frame_bytes
     each = len(packet.data) if within or len(packet.data) % whole else whole
     return round(lost_ns * 1e-9 * packet.pcm.sample_rate_hz * whole / each) * each
@@ -503,13 +503,13 @@ def _on_samples(
     added_ns = np.zeros(len(stamps_ns), dtype=np.int64)
     for k, more_ns in again:
         added_ns[k:] = more_ns
-        told = "%s: stamps of %s begin again at %.3f s (a bag in a loop?) and are counted on"
+        told = "%s: stamps of %s begin again at %.3f s (a bag in a loop?) and are continued"
         _LOG.warning(told, sound.path, sound.topic, seconds(int(lengths_ns[:k].sum())))
     stamps_ns = stamps_ns + added_ns
     lost_ns, early_ns = lost_before(stamps_ns, lengths_ns)
     if told := contradiction(stamps_ns, lengths_ns, lost_ns):
         problem = f"{sound.topic}: {told}: another rate (--audio-format), or a bag that was played in a loop"
-        raise InputFileError(sound.path, f"{problem} and whose passes its recorder mixed: record one pass")
+        raise InputFileError(sound.path, f"{problem} whose passes the recorder mixed: record one pass")
     return replace(
         sound,
         start_ns=sound.start_ns - round(early_ns),
@@ -547,7 +547,7 @@ def _timed(
     told = [(stamp_of(one.header), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)]
     stamped = [stamp_ns for stamp_ns, *_ in told if stamp_ns]
     if stands := 4 * len({*stamped}) < len(stamped):  # transports hardly ever repeat a message so often
-        _LOG.warning("%s: stamps of %s stand still, times of recording count", bag.path, topic)
+        _LOG.warning("%s: stamps of %s do not advance, so the times of recording are used", bag.path, topic)
     times = [sound.time_ns(0 if stands else stamp_ns, recorded_ns) for stamp_ns, recorded_ns, _ in told]
     order = in_order(times, f"{bag.path} {topic}")
     return [times[i] for i in order], [told[i][2] for i in order]

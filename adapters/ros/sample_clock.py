@@ -16,7 +16,7 @@ _BEFORE, _LEAST_BEFORE, _EARLY = 200, 3, 0.1
 _FEW_AFTER = 50
 # If stamps go back by more than this for so many messages, they start again, as of a bag played in a loop.
 _AGAIN_NS, _AGAIN = 2_000_000_000, 5
-# Stamps that span a smaller share of the samples, such as equal stamps, are no clock.
+# Stamps that span a smaller share of the samples, such as equal stamps, cannot be used as a clock.
 _LEAST_SPAN = 0.05
 # With a wrong rate, every piece of a recording is longer than the span of its stamps; with a stall, only some
 # pieces are.

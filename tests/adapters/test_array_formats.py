@@ -78,9 +78,9 @@ def test_a_configuration_of_odas_names_its_channels(tmp_path: Path) -> None:
 
 
 CONTRADICTED = {
-    "a gain": ("0.05,0,0,1.0\n0,0.05,0,0.9\n-0.05,0,0,1.1\n0,-0.05,0,0.95\n", "4 numbers a line"),
-    "index or height": ("1,0,0,5\n2,0,0,6\n3,0,0,7\n4,0,0,8\n", "4 numbers a line"),
-    "five numbers": ("0,0.05,0,0,1\n1,0,0.05,0,1\n2,-0.05,0,0,1\n", "5 numbers a line"),
+    "a gain": ("0.05,0,0,1.0\n0,0.05,0,0.9\n-0.05,0,0,1.1\n0,-0.05,0,0.95\n", "4 numbers per line"),
+    "index or height": ("1,0,0,5\n2,0,0,6\n3,0,0,7\n4,0,0,8\n", "4 numbers per line"),
+    "five numbers": ("0,0.05,0,0,1\n1,0,0.05,0,1\n2,-0.05,0,0,1\n", "5 numbers per line"),
     "3 x 4": ("0.05 0 -0.05 0\n0 0.05 0 -0.05\n0 0 0 0\n", "write its transpose"),
     "3 x 8": ("\n".join([",".join(["0.1"] * 8)] * 3), "write its transpose"),
     "3 x 4 in JSON": (json.dumps([[0.1, 0, -0.1, 0], [0, 0.1, 0, -0.1], [0] * 4]), "write its transpose"),

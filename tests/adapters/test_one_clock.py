@@ -158,9 +158,9 @@ def test_a_sensor_that_measured_nothing_draws_a_line(sound: Path, caplog: pytest
 DRIVE = {
     "as it is": ({}, ""),
     "yaw of many turns": ({"yaw_rad": 12.0}, ""),
-    "yaw in degrees": ({"yaw_rad": 187.0}, "yaw_rad has numbers such as of degrees"),
-    "yaw rate in degrees": ({"yaw_rate_rad_s": 5.7}, "yaw_rate_rad_s has numbers such as of degrees"),
-    "km/h": ({"speed_mps": 36.0}, "speed_mps has numbers such as of km/h"),
+    "yaw in degrees": ({"yaw_rad": 187.0}, "yaw_rad has numbers like those in degrees"),
+    "yaw rate in degrees": ({"yaw_rate_rad_s": 5.7}, "yaw_rate_rad_s has numbers like those in degrees"),
+    "km/h": ({"speed_mps": 36.0}, "speed_mps has numbers like those in km/h"),
 }
 
 

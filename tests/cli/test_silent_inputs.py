@@ -67,7 +67,7 @@ SILENT: dict[str, tuple[Mapping[str, object], str]] = {
         },
         "rear: no image was looked at",
     ),
-    "an empty context": ({"--context x.json": {}}, "nothing in it"),
+    "an empty context": ({"--context x.json": {}}, "it is empty"),
     "odometry, empty": ({"--odometry o.csv": odometry()}, "at least one line"),
     "odometry of another day": (
         {"--odometry o.csv": odometry(86_400.0, 86_400.1)},

@@ -127,8 +127,8 @@ def test_a_key_is_proved_by_any_sender_and_nothing_is_taken_twice():
         ({"port": "detections"}, "port: expected 'odometry', got 'detections'"),
         ({"port": None}, "port: expected 'odometry', got None"),
         ({"sent_s": None}, "sent_s: expected a finite number"),
-        ({"sent_s": -6.0}, r"sent_s: expected the time within 0.5 s, got one 6.0.. s ago"),
-        ({"sent_s": 6.0}, r"sent_s: expected the time within 0.5 s, got one -[56]...."),
+        ({"sent_s": -6.0}, r"sent_s: expected a time within 0.5 s of now, got one 6.0.. s ago"),
+        ({"sent_s": 6.0}, r"sent_s: expected a time within 0.5 s of now, got one -[56]...."),
     ],
 )
 def test_what_was_signed_for_another_port_or_time_is_refused(other, problem):

@@ -23,9 +23,9 @@ HOP_S = 0.1
 GAP_S = 2.5 * HOP_S
 # At 150 dots per inch a figure 9 inches wide has 1350 pixels, and is still sharp at the 830 of a README page.
 _DPI = 150
-# Each colour has one meaning in all figures. They are colours of Okabe and Ito and an indigo: in simulations
-# of the three colour vision deficiencies any two differ by at least 17 in CIELAB, and each has a contrast of
-# 3 on paper.
+# Each colour has one meaning in all figures. The palette is that of Okabe and Ito with an indigo. In
+# simulations of the three colour vision deficiencies any two colours differ by at least 17 in CIELAB, and
+# each has a contrast of 3 on paper.
 HIDDEN, IN_VIEW, SEARCHED = "#D55E00", "#0072B2", "#009E73"
 HEARD, TRUTH, DECISION = "#CC79A7", "black", "#332288"
 # Sides differ by line style, in the order of the context's directions, never by colour.

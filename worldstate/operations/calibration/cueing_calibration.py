@@ -229,7 +229,7 @@ def _by_miss_rate(
 
 
 def statistic_at(stream: HopTable, prior: Sequence[float], miss_rate: float) -> FloatArray:
-    r"""Return the statistic of every hop with an absence of a fixed miss rate, shape (n,).
+    r"""Return the statistic of every hop for an absence with a fixed miss rate, shape (n,).
 
     .. math:: s = \frac{\sum_k \pi_k \ell_k}
               {\sum_k \pi_k \ell_k + \beta\, \pi_{vis} \ell_{vis} + \pi_0 \ell_0}
@@ -282,7 +282,7 @@ def _warnings(budgets: list[BudgetReport], recordings: int) -> Iterator[str]:
             low, high = poisson_interval(count.onsets, count.hours)
             yield (
                 f"alpha {report.alpha:g}: {count.onsets} false alarms in {count.hours:.3g} h put their rate "
-                f"between {low:.3g} and {high:.3g} an hour; "
+                f"between {low:.3g} and {high:.3g} per hour; "
                 f"{enough_h:.2g} h would determine it to a factor of two"
             )
 

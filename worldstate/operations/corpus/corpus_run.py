@@ -101,8 +101,7 @@ class HearPlan:
     def shard(self, one: CorpusInput, content: str) -> str:
         """Return the file name of a recording, from everything that determines its bytes."""
         whole = hashlib.sha256(f"{self.card['digest']} {content}".encode()).hexdigest()[:32]
-        # A recording without content could not be read, perhaps temporarily, so that the next run tries
-        # again.
+        # An empty content means that the recording could not be read, so the next run tries again.
         return f"{one.key}-{whole if content else 'unread'}"
 
     def file(self, table: str, shard: str) -> Path:
@@ -150,7 +149,7 @@ def hear(
         Replaces the processes: an executor of `concurrent.futures`, or Dask's ``client.get_executor()``. Its
         workers need access to the same files and the same folder `out`.
     shard : (int, int)
-        Number of this share, from 1, and of all shares, to distribute the work over computers without an
+        Number of this share, from 1, and number of shares, to divide the work among computers without an
         executor.
     hops : bool
         Also write a row per hop, with its snapshot.

@@ -106,14 +106,15 @@ def calibrate_passes(
 
     Each level contains passes over the table, shape (n, 4): one per stream and cross-validation.
     """
-    # At an unknown junction, a classifier is between two cases that can be measured on the training set: one
-    # trained on fewer junctions without this one (leave one junction out), and one trained also on this one
-    # (leave recordings out). The first is too conservative and the second too bold, so the threshold is
-    # half-way between them. The mean is taken of the values, not of log-odds, in which one empty window with
-    # a confident classifier of a single junction would dominate. The threshold of a level is the mean over
-    # its passes, because the choice of the ten windows of a street changes the few scores that determine
-    # gamma. The risk map is that of the boldest level: statistics of windows that are compared with their
-    # site transfer to other sites, those of a classifier from too few junctions do not.
+    # At an unknown junction, the scores of a classifier are between those of two classifiers that can be
+    # measured on the training set. The first was trained on fewer junctions, without this one (leave one
+    # junction out); its threshold is too conservative. The second was also trained on this junction (leave
+    # recordings out); its threshold is too bold. The mean of the two thresholds is used. It is not a mean of
+    # log-odds, in which one empty window with a confident classifier of a single junction would dominate.
+    # The threshold of a level is the mean over its passes, because the choice of a street's ten windows
+    # changes the few scores that determine gamma. The risk map is that of the boldest level: statistics of
+    # windows that are compared with their site have the same meaning at other sites, but those of a
+    # classifier from too few junctions have not.
     if not levels or not all(levels):
         raise InvalidArgumentError("levels: expected at least one pass each")
     gammas = [
@@ -129,7 +130,8 @@ def calibrate_passes(
 
 
 def _gamma(score: FloatArray, alpha: float) -> float:
-    # No score is below 0; without this limit the least float of an unreachable budget would dominate a mean.
+    # No score is below 0. If all windows may be in alarm, the threshold is the least float, which would
+    # dominate a mean.
     return max(neyman_pearson_threshold(list(score[:, None]), alpha), 0.0)
 
 
