@@ -104,7 +104,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         not used.
     uncalibrated : bool
         Accept another array, sample rate or band than the model was made for. Then give the filter a policy
-        with alpha 0, because no false-alarm budget holds.
+        with alpha 0, because the false-alarm budget is not guaranteed.
     kinds : mapping of str to float, optional
         Share of each kind of road user that the model detected in its evaluation.
 

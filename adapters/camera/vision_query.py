@@ -32,9 +32,9 @@ SENSOR = "camera"
 # Number of points for the mean miss rate over the part of the sector in view. The table is piecewise linear
 # over tens of degrees, so more points do not change the mean.
 SAMPLES = 8
-# Trackers and boxes of whole objects may reach beyond an image. The image size is wrong if a larger share of
-# the boxes than the first is outside, or if half of them reach beyond it and one by more than the second
-# share of the width.
+# Trackers and boxes of whole objects may reach beyond an image. The boxes are of another image size if more
+# than the first share of them is outside, or if half of them reach beyond the image and one by more than the
+# second share of the width.
 _MOST_OUTSIDE, _FAR_BEYOND, _FEW_BOXES = 0.1, 0.01, 4
 _FEW_PX = 2.0
 _LOG = logging.getLogger(__name__)
@@ -68,11 +68,11 @@ class VisionQuery:
 
     - `Unqueried` if there are no detections, no frame at that time, or no part of the sector is in view;
     - `Present` if a moving box of an expected class overlaps the sector;
-    - `Unqueried` if another moving box overlaps it that the filter rejects but that may be of such a class;
+    - `Unqueried` if the filter rejects a moving box there that may be of an expected class;
     - `Absent` otherwise.
 
-    Its miss rate is the expectation over the sector and the mean over the expected classes C. It is 1 outside
-    the field of view, and for a class that the filter rejects,
+    Its miss rate is the expectation over the sector and the mean over the expected classes C. The rate is 1
+    outside the field of view and for classes that the filter rejects:
 
     .. math:: \beta = \frac{1}{|S|} \int_S \frac{1}{|C|} \sum_{c \in C} \beta_c(\theta, d)\, d\theta
 

@@ -46,7 +46,7 @@ _HEADER = re.compile(r"(?:pos(?:ition)?[ _]?)?([xyz])(?:[ _]*[\[(]?(mm|cm|m)[\])
 _TRANSPOSED = "three rows are a 3 x M matrix, as of MATLAB and pyroomacoustics: write its transpose"
 _MATRIX = "numpy.savetxt and MATLAB's writematrix write CSV of an M x 3 matrix"
 _DECIMAL_COMMAS = re.compile(r"(-?\d*,\d+|-?\d+)([;\s]+(-?\d*,\d+|-?\d+)){2,3}")
-# Comments of libconfig are removed and strings kept; an unterminated one extends to the end of the file.
+# Comments of libconfig are removed and strings kept; an unterminated comment extends to the end of the file.
 _COMMENT = re.compile(r'("(?:\\.|[^"\\])*"?)|#[^\n]*|//[^\n]*|/\*(?:.*?\*/|.*)', re.DOTALL)
 _MICS, _GROUPS = (
     re.compile(r"\bmics\s*[:=]\s*[(\[](?=[\s,]*[{@])"),
@@ -100,8 +100,8 @@ def read_array(path: str | Path, axes: Axes | None = None) -> MicrophoneArray:
     InputFileError
         If the file is missing, too large or in none of the four formats; contains a document type or
         entities; has fewer than two microphones, or two at the same place; a coordinate is missing or not
-        finite; the array cannot be in metres; or it has no horizontal extent, so that a vertical line cannot
-        resolve azimuth.
+        finite; the array cannot be in metres; or it has no horizontal extent (a vertical line cannot resolve
+        azimuth).
 
     Examples
     --------
@@ -255,7 +255,7 @@ def _check_size(path: Path, positions_m: FloatArray) -> None:
     extent_m, spacings_m = np.ptp(positions_m, axis=0), nearest_spacings_m(positions_m)
     wide_m, mean_m, least_m = float(extent_m.max()), spacings_m.mean(), spacings_m.min()
     upright = extent_m[:2].max() < MIN_SPACING_M and least_m >= LEAST_SPACING_M
-    # Two microphones at the same place in an otherwise plausible array are not a wrong unit;
+    # Two microphones at the same place in an otherwise plausible array do not show a wrong unit;
     # `MicrophoneArray` reports them.
     small = LEAST_SPACING_M <= least_m < MIN_SPACING_M or 0.0 < mean_m < MIN_SPACING_M
     metres = "expected positions in metres, got"
@@ -326,7 +326,7 @@ def _csv_columns(path: Path, cells: list[list[str]]) -> tuple[list[int], int | N
 
 
 def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]:
-    """Return the columns of four-number lines if exactly one of first and last numbers the microphones."""
+    """Return the columns of four-number lines if either the first or the last numbers the microphones."""
     counted = [{row[i] for row in cells if len(row) == 4 and row[i].isdecimal()} for i in (0, 3)]
     counts = [i for i, found in zip((0, 3), counted, strict=True) if len(found) == len(cells)]
     if len(counts) == 1:

@@ -88,7 +88,7 @@ def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: st
 
 
 def by_number(path: Path, names: Sequence[str]) -> list[int]:
-    """Return the order of microphones with numbered names; warn if the given order is another.
+    """Return the order of microphones with numbered names; warn if they are given in another one.
 
     If the names differ only in their numbers and are sorted as by a shell or a spreadsheet (mic_1, mic_10,
     mic_2), they are sorted by number. Any other order is taken as intended and kept.

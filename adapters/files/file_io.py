@@ -131,7 +131,7 @@ def line_writer(path: Path | None, opener: FileOpener = whole_file) -> Iterator[
 
 
 class GrowingFile:
-    """Log file of an unlimited run, which has its name from the start and contains each record at once.
+    """Log file of an unlimited run, which has its name from the start and is never buffered.
 
     An earlier file of the same name is renamed to NAME.N.SUFFIX with the first free number, and so is a full
     file; only one full file of this run is kept. A record that cannot be written, or whose file was removed,
@@ -478,7 +478,7 @@ def _places(
 
 
 def in_order(stamps_ns: Sequence[int], source: str) -> list[int]:
-    """Return the positions of increasing stamps, the last one of equal stamps; warn of any others.
+    """Return the positions of the sorted stamps, only the last one of equal stamps; warn of any change.
 
     Examples
     --------

@@ -19,7 +19,7 @@ from .file_io import in_order, number, read_rows, refused_as_file
 STANDING_MPS = 0.2
 _LOG = logging.getLogger(__name__)
 # No tyre sustains more lateral acceleration, and no localiser turns that far unless in degrees. If speeds are
-# in km/h, poses move by the 3.6th part of them.
+# in km/h, the poses are 3.6 times closer together than the speeds imply.
 MOST_ACROSS_MPS2, MOST_TURNED_RAD, LEAST_MOVED = 15.0, 25.0, 0.4
 # Three hours at 100 Hz with poses.
 MAX_BYTES, MAX_ROWS = 128 << 20, 1_080_000

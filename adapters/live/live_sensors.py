@@ -52,7 +52,7 @@ PINNED_S = 10.0
 
 
 # Largest difference between the sending time in a datagram and this computer's clock. Clocks with NTP differ
-# by milliseconds; a datagram delayed by an attacker for longer must not appear recent.
+# by milliseconds; a datagram that an attacker delays for longer is refused.
 CLOCKS_APART_S = 0.5
 # Receive buffer for datagrams that arrive while another thread computes; the kernel may grant less.
 _KERNEL_BYTES = 1 << 22

@@ -127,10 +127,10 @@ BLOCKS_PER_SECOND = 40
 # Largest waiting time of sound. A short stall of the process is made up for; sound that waits longer is
 # dropped, because a later state is no warning.
 LONGEST_WAIT_S = 2.0
-# Duration up to which (plus at most one hop) lost sound is replaced by silence: a window that the snapshot
-# reports as lost samples, but not yet as dead microphones. Silence takes as long to process as sound, so a
-# slow computer would fall behind by all it loses. The rest of a longer gap is left out together with all
-# waiting blocks, so that the sound after it is continuous.
+# Lost sound of up to this duration, plus at most one hop, is replaced by silence. The snapshot then reports
+# lost samples, but not yet dead microphones. Silence takes as long to process as sound, so a slow computer
+# would fall behind by all it loses. The rest of a longer gap is left out together with all waiting blocks, so
+# that the sound after it is continuous.
 HEARD_SILENCE_S = 0.9
 # A longer gap is no loss; the device was asleep.
 LONGEST_GAP_S = 60.0

@@ -1,13 +1,13 @@
 r"""Offset of a camera's clock and yaw against the array, from the bearings of vehicles in view.
 
 A bearing of the sound is either that of the vehicle in view, with a normal error, or that of another source,
-at a uniform azimuth. With the position b(t) of the sound source in the boxes, offset d and yaw y,
+at a uniform azimuth. With the position b(t) of the sound source in the boxes, clock offset d and yaw y, the
+log-likelihood is
 
 .. math:: L(d, y) = \sum_i \log\Big(\epsilon + (1 - \epsilon)\, \pi\,
       N\big(\theta_i; b(t_i - d) + y, \sigma^2\big)\Big)
 
-to which a bearing adds nothing if there is no box at its time. L is computed on a grid, so that no initial
-value is needed.
+A bearing without a box at its time adds nothing. L is computed on a grid, so that no initial value is needed.
 """
 
 from collections.abc import Iterator, Sequence

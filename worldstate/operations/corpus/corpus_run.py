@@ -1,4 +1,4 @@
-"""Processing of a corpus: each recording once, by any number of processes or computers, to Parquet."""
+"""Process each recording of a corpus once, on any number of processes or computers, into Parquet tables."""
 
 import hashlib
 import json

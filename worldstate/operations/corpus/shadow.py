@@ -53,7 +53,7 @@ class ShadowHours:
 
 
 def shadow_hours(rows: Iterable[StateHours], budget: float | None) -> dict[str, list[ShadowHours]]:
-    """Return hours and onsets of all recordings, and by site, day, state of the sensors and unusable reason.
+    """Return hours and onsets of all recordings, then by site, day, sensor state and reason if unusable.
 
     Examples
     --------
@@ -83,7 +83,7 @@ def _hours(name: str, count: list[int], budget: float | None) -> ShadowHours:
 
 
 def hours_to_prove(onsets: int, hours: float, budget: float) -> float | None:
-    r"""Return the further hours until the exact 95 % interval of the rate is below a budget; None if never.
+    r"""Return how many more hours bring the 95 % interval of the rate below a budget; None if none do.
 
     If onsets continue at the observed rate r, the total time is the least T with
 

@@ -29,11 +29,12 @@ from .pass_labels import PassLabel
 COLUMNS = ("ID", "Class", "Environment", "Recording ID", "File", "End", "T0", "T0 std")
 # A window around T0 that is off by half a second contains sound of the next class.
 SUREST_STD_S = 0.3
-# Error of a hand-over as T0: in the demo it is 0.16 s late, an image and a hop.
+# Standard deviation of T0 from a hand-over: in the demo it is 0.16 s late, which is an image and a hop.
 HANDED_OVER_STD_S = 0.2
 _NO_FILES = {LOG_SUFFIX, *STORAGE_SUFFIXES}  # Logs have no sound, and `model features` cannot read bags
 _LOOKED = 0.9  # Least share of hops with a look of a camera, without which no window is known to be empty
-# As in streams: no vehicle comes within the first time, and a vehicle has left the view for the second.
+# As in streams: no vehicle comes within `CALM_S` after an empty window, or is in view from `GONE_S` before
+# it.
 CALM_S, GONE_S, NONE_EVERY_S, TOGETHER_S = 5.0, 2.0, 10.0, 2.5
 
 
@@ -106,7 +107,7 @@ def window_rows(
     environment: str,
     file: str,
 ) -> list[tuple[object, ...]]:
-    """Return the windows of one recording: one per pass at T0, one in view after it, and empty ones.
+    """Return the windows of one recording: per pass one at T0 and one in view, and windows without vehicles.
 
     Shapes: in_view (n,), of the times, time_s (n,).
     """

@@ -139,7 +139,7 @@ _ACCELERATION_PSD, _MANOEUVRE_K = 0.03, 1.2
 _SMOOTHING = SmoothingSettings(
     lag_s=30.0, relinearize_every=1000, acceleration_psd=_ACCELERATION_PSD, manoeuvre_k=_MANOEUVRE_K
 )
-# At the earliest hop: behind the corner, at walking pace to 15 m/s, about 10 to 100 m away.
+# Prior at the earliest hop: behind the corner, at walking pace to 15 m/s, about 10 to 100 m away.
 _START_STD = (math.radians(25.0), 0.25, 0.3, 0.6)
 _START_RAD, _START_M = math.radians(55.0), 30.0
 

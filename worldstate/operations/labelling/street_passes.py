@@ -71,7 +71,7 @@ class HeardStreet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchedRecording:
-    """Passes of a street in one recording, and its sound."""
+    """Passes that a camera saw on a street in one recording, and the sound."""
 
     passes: Sequence[PassLabel]
     duration_s: float

@@ -117,12 +117,12 @@ class ApproachOutcome:
     (True, False)
     """
 
-    lead_s: float  # From the first valid alarm to T0; 0 if missed
-    onsets: int = 0  # In the valid seconds before T0
+    lead_s: float  # From the first alarm within the longest lead to T0; 0 if missed
+    onsets: int = 0  # Within the longest lead before T0
     onsets_earlier: int = 0  # Before those
     onsets_after: int = 0  # In the 6 s after the last T0 (streams only)
     # Whether the side of the first vehicle, the other side, and the sides of all vehicles were in alarm, each
-    # in the valid seconds before its T0 (streams only).
+    # within the longest lead before its T0 (streams only).
     own_side: bool = False
     other_side: bool = False
     every_side: bool = False
@@ -173,7 +173,7 @@ def hop_outcome(
 ) -> ApproachOutcome:
     """Return the outcome of one approach in a stream: time_s (n,), alarm of either side (n, 2).
 
-    Alarms are valid from `longest_s` before T0.
+    Alarms more than `longest_s` before T0 are ignored.
 
     Examples
     --------
@@ -236,7 +236,7 @@ class ApproachTable:
         return self.detections() | self.false_alarms()
 
     def detections(self) -> Figures:
-        """Return detected share with exact 95 % interval, and mean lead, with misses excluded and as 0."""
+        """Return the detected share with exact 95 % interval, and the mean lead with and without misses."""
         detected = [one.detected for one in self.outcomes]
         low, high = share_interval(sum(detected), len(detected)) if detected else (None, None)
         return {

@@ -25,7 +25,7 @@ from worldstate.operations import figure_style as style
 _SIGNIFICANT = 4.0
 # Crystals are off by about as much; a smaller error changes neither bearing nor level.
 _TOLERATED = 1e-5
-# Other faults that a fault resembles, before it is detected or at times.
+# Other faults that each fault explains: they may be reported before it, or now and then.
 _EXPLAINS = {
     Fault.GUSTS: {Fault.NOISY, Fault.INTERMITTENT, Fault.DEAD, Fault.DELAY, Fault.DRIFT},
     Fault.SWAPPED: {Fault.NOISY},
@@ -49,8 +49,8 @@ _MARKS: dict[Fault, dict[str, Any]] = {
     fault: {"color": style.CATEGORIES[i % 6], "marker": "oD"[i // 6], "alpha": 0.8, "lw": 0}
     for i, fault in enumerate(Fault)
 }
-# Areas of markers, points squared: for a number of two digits, and for a line of the legend; and the ratio of
-# the area of a second fault to that of the first.
+# Areas of markers in points squared, for a number of two digits and for a line of the legend; then the ratio
+# of a second fault's area to the first.
 _AREA, _LEGEND_AREA, _SMALLER = 240.0, 80.0, 0.55
 _VIEWS = {
     (1, 2): "seen from behind",
@@ -216,7 +216,7 @@ class HealthLog:
         return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in _one_cause(kept))
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:
-        """Return whether the channel was more often intermittent than dead, or the reverse."""
+        """Return whether the channel has the other of the faults dead and intermittent more often."""
         others = {Fault.DEAD: Fault.INTERMITTENT, Fault.INTERMITTENT: Fault.DEAD}
         other = self._seen.get((verdict.channel, others.get(verdict.fault, verdict.fault)))
         return other is not None and other.fault != verdict.fault and other.share > verdict.share

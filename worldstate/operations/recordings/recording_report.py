@@ -99,7 +99,7 @@ class WarningMeter:
 
     @property
     def usable(self) -> str:
-        """Number of states with usable cues, and of states with each reason against, in words."""
+        """The number of states with usable cues, and of those with each reason against use, in words."""
         if not self.unusable:
             return "in every hop"
         given = ", ".join(f"{reason} {number}" for reason, number in self.reasons.items())

@@ -12,7 +12,7 @@ from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-# Contents of a stream's first ten seconds: nearly always an empty street.
+# Length of a stream and share of hazards in it, as in the first ten seconds at a street, mostly empty.
 STREAM_WINDOWS = 10
 STREAM_HAZARDS = 0.05
 # Thresholds are set on this many random streams, so that gamma depends less on the windows of one street.
