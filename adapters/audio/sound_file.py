@@ -218,11 +218,6 @@ def open_audio(
     short : bool
         Whether the recording may be shorter than 1 s.
 
-    Returns
-    -------
-    AudioSource
-        The open recording, at its start.
-
     Raises
     ------
     InputFileError
@@ -553,11 +548,6 @@ def open_sound(
         unchanged.
     strict : bool
         As for `open_audio`.
-
-    Returns
-    -------
-    Audio
-        The open recording, at its start.
 
     Raises
     ------

@@ -179,13 +179,6 @@ class MissRates:
 def save_miss_rates(path: str | Path, rates: MissRates) -> None:
     """Write miss rates to a file, atomically.
 
-    Parameters
-    ----------
-    path : str or Path
-        File to write.
-    rates : MissRates
-        Rates to write.
-
     Raises
     ------
     InputFileError
@@ -205,16 +198,6 @@ def save_miss_rates(path: str | Path, rates: MissRates) -> None:
 
 def load_miss_rates(path: str | Path) -> MissRates:
     """Read a file written by `save_miss_rates`.
-
-    Parameters
-    ----------
-    path : str or Path
-        JSON file.
-
-    Returns
-    -------
-    MissRates
-        The rates of the file.
 
     Raises
     ------

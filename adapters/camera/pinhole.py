@@ -168,7 +168,7 @@ class PinholeCamera:
         return np.asarray((right <= off_axis) & (off_axis <= left))
 
     def sighting(self, box_px: ArrayLike, label: str, score: float, *, moving: bool = True) -> Sighting:
-        r"""Convert a box to a sighting.
+        r"""Convert a box to a sighting in `base_link`.
 
         The azimuth is that of the box's centre column. Its variance has two parts: the sound source may be
         anywhere across the box, and its range is unknown,
@@ -185,11 +185,6 @@ class PinholeCamera:
             Class and score from the detector.
         moving : bool
             False for a parked object.
-
-        Returns
-        -------
-        Sighting
-            In `base_link`.
 
         Raises
         ------
@@ -241,16 +236,6 @@ def read_camera(path: str | Path) -> PinholeCamera:
     Optional, with default 0, are ``"yaw_deg"`` (left positive), ``"pitch_deg"`` (up positive), ``"roll_deg"``
     (left side up) and ``"stamp_offset_s"``, which is added to the camera's stamps to obtain the clock of the
     sound.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    PinholeCamera
-        The camera of the file.
 
     Raises
     ------

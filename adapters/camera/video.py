@@ -54,11 +54,6 @@ def open_video(path: str | Path) -> Video:
     path : str or Path
         Any container format that OpenCV reads.
 
-    Returns
-    -------
-    Video
-        The file with its frame rate and size.
-
     Raises
     ------
     InputFileError

@@ -242,11 +242,6 @@ class VisionQuery:
         side : {"left", "right"}, optional
             Search this whole side, 0 to 90 deg, for a source whose bearing is coarse.
 
-        Returns
-        -------
-        CoEvidence
-            Present, Absent or Unqueried.
-
         Examples
         --------
         >>> nothing = VisionQuery(PinholeCamera.ovad(), detections=None)

@@ -61,11 +61,6 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
     array : MicrophoneArray
         Array with microphones in the order of the channels.
 
-    Yields
-    ------
-    ndarray, shape (60,)
-        The features in the order of the windows.
-
     Raises
     ------
     InputFileError
@@ -119,7 +114,6 @@ def feature_table(
 
 
 def _rate_hz(path: Path) -> int:
-    """Return the sample rate of a sound file."""
     with open_audio(path, strict=False) as source:
         return source.sample_rate_hz
 

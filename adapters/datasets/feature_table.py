@@ -136,16 +136,6 @@ class FeatureTable:
 def read_features(path: str | Path) -> FeatureTable:
     """Read a table of windows, and its domain from `FILE.csv.json` if that exists.
 
-    Parameters
-    ----------
-    path : str or Path
-        CSV file.
-
-    Returns
-    -------
-    FeatureTable
-        The windows in the order of the file.
-
     Raises
     ------
     InputFileError
@@ -178,13 +168,6 @@ def write_features(path: str | Path, table: FeatureTable) -> None:
     """Write a table of windows, atomically; `read_features` returns exactly the same values.
 
     The domain is written to `FILE.csv.json`, so that other tools can read the columns unchanged.
-
-    Parameters
-    ----------
-    path : str or Path
-        File to write.
-    table : FeatureTable
-        Windows to write.
 
     Raises
     ------

@@ -86,13 +86,6 @@ class Checkpoint:
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint to a file, atomically.
 
-    Parameters
-    ----------
-    path : str or Path
-        File to write.
-    checkpoint : Checkpoint
-        Checkpoint to write.
-
     Raises
     ------
     InputFileError
@@ -110,17 +103,7 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
-    """Read a checkpoint.
-
-    Parameters
-    ----------
-    path : str or Path
-        File that `save_checkpoint` wrote.
-
-    Returns
-    -------
-    Checkpoint
-        The checkpoint of the file.
+    """Read a file written by `save_checkpoint`.
 
     Raises
     ------

@@ -88,16 +88,6 @@ def read_context(path: str | Path) -> Context:
     ``"priors"`` with the fields of `Rates` and `Priors`, ``"ego_speed_mps"``, ``"site"`` and
     ``"view_half_angle_deg"``.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    Context
-        The context of the file.
-
     Raises
     ------
     InputFileError

@@ -207,11 +207,6 @@ def read_model(
     array : MicrophoneArray, optional
         Array of the recording. The shipped model for a board with these microphones is read, if there is one.
 
-    Returns
-    -------
-    Model
-        The model with its provenance.
-
     Raises
     ------
     InputFileError
@@ -257,14 +252,7 @@ def _shipped(path: Path) -> Model:
 
 
 def save_model(path: str | Path, model: Model) -> None:
-    """Write a model to a file, atomically.
-
-    Parameters
-    ----------
-    path : str or Path
-        File to write; compressed if its name ends in .gz.
-    model : Model
-        Model to write.
+    """Write a model to a file, atomically; compressed if the name ends in .gz.
 
     Raises
     ------

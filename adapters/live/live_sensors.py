@@ -297,7 +297,6 @@ class OdometrySocket(DatagramSocket[OdometryRecord]):
 
 
 def _bound_socket(address: str, option: str) -> socket.socket:
-    """Return a socket for datagrams at HOST:PORT."""
     target = host_and_port(option, address)
     listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with suppress(OSError):

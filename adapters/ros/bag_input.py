@@ -462,7 +462,6 @@ def _frame_name(text: str) -> str:
 
 
 def _in_parent(path: Path, transform: Any, points_m: FloatArray) -> FloatArray:
-    """Convert points of a frame to its parent frame."""
     from scipy.spatial.transform import Rotation
 
     turn, by = transform.rotation, transform.translation

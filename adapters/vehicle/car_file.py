@@ -156,16 +156,6 @@ def read_car(path: str | Path) -> CarSensors:
     ``"odometry"``, ``"measurements": {NAME: FILE}`` and ``"crossing_m"`` are those of `CarSensors`. Every key
     is optional; paths are relative to the folder of the car file.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    CarSensors
-        The sensors of the file.
-
     Raises
     ------
     InputFileError
@@ -240,7 +230,6 @@ class _ArrayRecord:
     roll_deg: float = field(default=0.0, metadata=ADDED)
 
     def array(self, path: Path) -> MicrophoneArray:
-        """Return the array as mounted."""
         if (self.file is None) == (self.positions_m is None):
             raise InvalidArgumentError("car.array: expected either file or positions_m")
         file = self.file
@@ -264,7 +253,6 @@ class _CarFile:
     crossing_m: float = field(default=9.0, metadata=ADDED)
 
     def car(self, path: Path) -> CarSensors:
-        """Return the sensors with the origin at the array."""
         if len(self.cameras) > MOST_CAMERAS:
             got = len(self.cameras)
             raise InvalidArgumentError(f"car.cameras: expected at most {MOST_CAMERAS}, got {got}")
@@ -303,7 +291,6 @@ def _setup(record: CameraRecord, folder: Path) -> CameraSetup:
 
 
 def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:
-    """Return a camera with its position relative to the array."""
     if record.position_m is None:
         return record.camera()  # raises the error
     there = Mounting(record.position_m).position_m

@@ -105,11 +105,6 @@ class ArrayBounds:
     def to_dict(self) -> dict[str, object]:
         """Return the fields as values for JSON, with azimuths as text.
 
-        Returns
-        -------
-        dict
-            One entry per field.
-
         Examples
         --------
         >>> array_bounds(MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), 500.0, [90.0]).to_dict()["sigma_deg"]

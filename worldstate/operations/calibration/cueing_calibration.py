@@ -214,7 +214,6 @@ def _by_miss_rate(
     kept: CueingPolicies,
     settings: CueingSettings,
 ) -> tuple[list[BudgetReport], list[CueingPolicy]]:
-    """Return a report and a policy per miss rate and budget."""
     budgets, policies = list[BudgetReport](), list[CueingPolicy]()
     for beta in sorted(MISS_RATES):
         calm = [statistic_at(stream, prior, beta) for stream in free]

@@ -279,5 +279,4 @@ def _source(plan: HearPlan, one: CorpusInput) -> Source:
 
 @cache
 def _model(path: Path) -> Model:
-    """Read a model once per process."""
     return read_model(path)

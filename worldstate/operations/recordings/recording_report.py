@@ -198,11 +198,6 @@ def run_recording(
     on_hop : callable
         Called after each hop, for progress.
 
-    Returns
-    -------
-    RecordingReport
-        Summary of advisories and health.
-
     Raises
     ------
     InputFileError
@@ -276,7 +271,6 @@ def _side(track: TrueTrack) -> str:
 
 
 def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
-    """Return the onset times of advisories by side, seconds."""
     onsets, standing = dict[str, list[float]](), set[str]()
     for state in states:
         raised = {cue.direction for cue in state.cues if cue.advisory and cue.direction}

@@ -266,11 +266,6 @@ def train_model(
     on_step : callable
         Called after each cross-validation and after the last fit.
 
-    Returns
-    -------
-    Model
-        Signature, policies and provenance.
-
     Raises
     ------
     MissingExtraError
@@ -378,7 +373,6 @@ def _policies(
 
 
 def _figures(table: FeatureTable, passes: list[FloatArray], repeats: int) -> dict[str, float]:
-    """Return out-of-fold figures, averaged over repeats and streams."""
     scored, classes = table.hazards | table.hazard_free, np.array(CLASSES)
 
     def area(miss_rate: float) -> float:
