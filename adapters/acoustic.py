@@ -100,8 +100,8 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
     road_users : RoadUserModel, optional
         Classifies road users by their sound; the camera is searched for these classes.
     sequence : SequenceReader or NotUsable, optional
-        Estimates from seconds of evidence from which sides a vehicle comes, and when; or the reason why it is
-        not used.
+        Estimates the sides from which a vehicle comes, and when, from seconds of evidence; or the reason why
+        no sequence is used.
     uncalibrated : bool
         Accept another array, sample rate or band than the model was made for. Then give the filter a policy
         with alpha 0, because the false-alarm budget is not guaranteed.

@@ -75,7 +75,7 @@ _FORMS = {"s16": "<i2", "s24": "", "s32 or s24_32": "<i4", "s16, big-endian": ">
 
 
 def smooth_form(data: bytes, stated: Encoding, channels: int) -> str | None:
-    """Return the format in which samples are smooth that are loud noise in the stated one; None if none.
+    """Return a format in which samples are smooth while they are loud noise in the stated one, or None.
 
     Pairs of 16-bit samples are also smooth as 32-bit numbers; the lower halves of such numbers are not.
 

@@ -405,7 +405,7 @@ def _record_in(hint: Any) -> Any:
 
 @contextmanager
 def refused_as_file(path: object, where: str = "") -> Iterator[None]:
-    """Convert errors inside to errors of a file, with its name and the place in it."""
+    """Convert errors in the context to errors of a file, with its name and the place in it."""
     try:
         yield
     except SchemaVersionError as error:

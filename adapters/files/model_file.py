@@ -162,7 +162,7 @@ class Model:
     provenance : Provenance
         Origin of the model.
     sequence : SequenceModel, optional
-        Estimates from seconds of the signature's evidence from which sides a vehicle comes, and when.
+        Estimates the sides from which a vehicle comes, and when, from seconds of the signature's evidence.
     street : StreetModel, optional
         Parameters of the belief about the approach sides. None in files of a version before 1.7, for which
         the shipped parameters are used.

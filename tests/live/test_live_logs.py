@@ -187,7 +187,7 @@ def test_a_log_that_is_removed_is_a_notice_and_begins_anew(tmp_path, caplog, rem
             write(f"after {round_}")
             assert path.read_text() == f"after {round_}\n"
             assert [record.getMessage() for record in caplog.records] == [
-                f"{path}: expected the file that was begun, it was moved or removed"
+                f"{path}: expected the file of this run, but it was moved or removed"
             ] * (round_ + 1)
     assert not (tmp_path / "log.1.jsonl").exists()
 

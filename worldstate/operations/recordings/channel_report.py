@@ -216,7 +216,7 @@ class HealthLog:
         return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in _one_cause(kept))
 
     def _is_other_half(self, verdict: ChannelVerdict) -> bool:
-        """Return whether the channel has the other of the faults dead and intermittent more often."""
+        """Return whether the channel has the other fault, dead or intermittent, in more hops."""
         others = {Fault.DEAD: Fault.INTERMITTENT, Fault.INTERMITTENT: Fault.DEAD}
         other = self._seen.get((verdict.channel, others.get(verdict.fault, verdict.fault)))
         return other is not None and other.fault != verdict.fault and other.share > verdict.share
@@ -262,7 +262,7 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
                 arrow["connectionstyle"] = "arc3,rad=0.2"
                 axes.annotate("", place[verdict.looks_like], place[verdict.channel], arrowprops=arrow)
         axes.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", aspect="equal")
-        axes.margins(0.08)  # shows markers at the edge completely
+        axes.margins(0.08)  # so that markers at the edge are complete
         if across == 1:
             axes.invert_xaxis()  # so that left is on the left
         axes.set_title(f"{array.n_microphones} microphones {_VIEWS[across, up]}; channels from 1")

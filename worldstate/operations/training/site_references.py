@@ -12,7 +12,7 @@ from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 
-# Length of a stream and share of hazards in it, as in the first ten seconds at a street, mostly empty.
+# Number of windows in a stream, and share of them with a hazard, for the first ten seconds at a street.
 STREAM_WINDOWS = 10
 STREAM_HAZARDS = 0.05
 # Thresholds are set on this many random streams, so that gamma depends less on the windows of one street.

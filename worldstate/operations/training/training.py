@@ -164,7 +164,7 @@ def folds_by_recording(table: FeatureTable, rng: np.random.Generator) -> TextArr
 
 
 def junction_folds(table: FeatureTable) -> TextArray:
-    """Return the junction of each window, as folds that leave one junction out."""
+    """Return the junction of each window as its fold, to leave one junction out."""
     if len(np.unique(table.environments)) < 2:
         raise InvalidArgumentError("expected at least two junctions to leave one out")
     return table.environments
