@@ -17,7 +17,7 @@ from .array_match import TRAIN, WAY_OUT, matched_order
 from .model_file import Model
 from .odometry_file import STANDING_MPS
 
-UNFIT = "the model says that it is unfit for use"
+UNFIT = "the model is marked as unfit for use"
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ def states_budget(model: Model, array: MicrophoneArray, moving_ego: bool) -> boo
     """
     domain = model.domain
     if domain is None:
-        _LOG.warning("the model does not name its array: no budget is guaranteed")
+        _LOG.warning("the model file has no array: no budget is stated")
         return False
     check_array(domain, array, WAY_OUT)
     if domain.ego_motion == ("standing" if moving_ego else "moving"):

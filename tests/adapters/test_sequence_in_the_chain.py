@@ -163,7 +163,7 @@ def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path)
     assert free.no_sequence is not None and free.no_sequence.reason.startswith("uncalibrated")
     unfit = replace(model, provenance=replace(model.provenance, fit_for_use=False))
     quick = next(listen_steps(open_source(folder / "sound.wav", model=unfit))).state
-    assert quick.no_sequence == NotUsable("the model says that it is unfit for use")
+    assert quick.no_sequence == NotUsable("the model is marked as unfit for use")
     assert {cue.within for cue in (*moving.cues, *free.cues, *quick.cues)} == {None}
 
 

@@ -109,7 +109,7 @@ def heard_street(source: Source, model: Model) -> HeardStreet | None:
         return None
     if model.domain is None or not isinstance(listened.sequence, SequenceModel):
         told = listened.sequence
-        _LOG.warning(_UNHEARD, told.reason if isinstance(told, NotUsable) else "the model names no array")
+        _LOG.warning(_UNHEARD, told.reason if isinstance(told, NotUsable) else "the model file has no array")
         return None
     read = [
         (seconds(frame.stamp_ns), frame.feature, measured.sequence.groups)
