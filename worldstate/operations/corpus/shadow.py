@@ -1,6 +1,6 @@
-"""Shadow operation: onset rates by site, day and state of the sensors, with every advisory counted as false.
+"""Shadow operation: onset rates by site, day and state of the sensors, with every advisory taken as false.
 
-Advisories about real vehicles are also counted, so the rates are upper bounds of the false-alarm rate.
+Advisories about real vehicles are included, so the rates are upper bounds of the false-alarm rate.
 """
 
 import math

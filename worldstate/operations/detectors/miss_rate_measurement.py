@@ -35,7 +35,7 @@ MakeDetector = Callable[[], Detector]
 
 # Inner edges of the azimuth bins off the optical axis, which extend from 0 to the edge of the view.
 _BINS_DEG = (10.0, 20.0, 30.0)
-# Least IoU at which a reference box counts as found.
+# Least IoU at which a reference box is found.
 MIN_OVERLAP = 0.3
 # Half the width of a query sector for clutter, and distance between the sectors.
 _HALF_WIDTH_RAD, _SECTOR_STEP_RAD = float(np.radians(10.0)), np.radians(5.0)
@@ -49,14 +49,14 @@ REPEATS = 3.0
 
 @dataclass(frozen=True, slots=True)
 class AbsenceSettings:
-    """Settings for the counts of misses.
+    """Settings of the measurement.
 
     Parameters
     ----------
     families : tuple of str
         Degradations that are simulated.
     keep : DetectionFilter
-        Filter of the reference boxes. Parked objects are not counted, because they are no co-evidence, and
+        Filter of the reference boxes. Parked objects are excluded, because they are no co-evidence, and
         motion detectors do not find them.
 
     Raises
@@ -118,7 +118,7 @@ def measure_absence(
     rng : numpy.random.Generator
         Generates the simulated noise.
     settings : AbsenceSettings, optional
-        Settings of the counts.
+        Settings of the measurement.
     provenance : dict of str, optional
         Metadata for the file.
     on_frame : callable
@@ -127,7 +127,7 @@ def measure_absence(
     Returns
     -------
     MissRates
-        Counts per family, azimuth bin and level.
+        Looks and misses per family, azimuth bin and level.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def measure_absence(
 
 
 class AbsenceTally:
-    """Counts of looks and misses per family, from detections on degraded frames."""
+    """Sums of looks and misses per family, from detections on degraded frames."""
 
     def __init__(self, camera: PinholeCamera, settings: AbsenceSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -214,7 +214,7 @@ class AbsenceTally:
         self._clutter[families, level] += sum(touched)
 
     def counts(self) -> dict[str, FamilyCounts]:
-        """Return the current counts per family."""
+        """Return the sums so far per family."""
         every = zip(self._looks, self._misses, self._sectors, self._clutter, strict=True)
         return {
             family: FamilyCounts(*map(as_tuples, counted))
