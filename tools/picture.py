@@ -99,11 +99,12 @@ def above(axes: Axes, state: WorldState, site: dict, track: TrueTrack, at: int) 
     for cue in state.cues:
         side = -1 if cue.direction == "left" else 1
         low, high = cue.sector_rad or (cue.azimuth_rad - 0.3, cue.azimuth_rad + 0.3)
-        risk = cue.risk or 0.0
+        # Without sound of its own, or while a louder vehicle masks it, a side has no usable risk.
+        risk = cue.risk or 0.0 if cue.usable else 0.0
         first, last = math.degrees(low) + 90.0, math.degrees(high) + 90.0
         axes.add_patch(Wedge((0, 0), 60.0, first, last, color=HIDDEN, alpha=0.55 * risk, lw=0))
-        weight, color = ("bold", HIDDEN) if cue.advisory else ("normal", TEXT)
-        words = f"{cue.direction}: {100 * risk:.0f} %"
+        weight, color = ("bold", HIDDEN) if cue.advisory else ("normal", TEXT if cue.usable else MUTED)
+        words = f"{cue.direction}: {100 * risk:.0f} %" if cue.usable else f"{cue.direction}: {cue.why_not[0]}"
         axes.text(side * 14.0, -1.6, words, color=color, size=13, weight=weight, ha="center", va="center")
     front_x, front_y = -track.position_m[at][1], track.position_m[at][0]
     heading = -1 if track.position_m[at + 1][1] > track.position_m[at][1] else 1
@@ -167,7 +168,8 @@ def chart(axes: Axes, state: WorldState, shown: list[WorldState], track: TrueTra
         style = {"lw": 2.6} if side == own else {"lw": 1.4, "ls": (0, (4, 2))}
         axes.plot(time_s, risk, color=HIDDEN, **style)
         place = {"va": "bottom" if side == highest else "top", "size": 10, "color": HIDDEN}
-        axes.text(time_s[-1], risk[-1], f" {side}", **place)
+        if not math.isnan(risk[-1]):
+            axes.text(time_s[-1], risk[-1], f" {side}", **place)
     raised = [when for when, one in zip(time_s, past, strict=True) if any(cue.advisory for cue in one.cues)]
     if raised:
         axes.axvspan(raised[0], raised[-1] + 0.1, color=HIDDEN, alpha=0.14, lw=0)
@@ -179,8 +181,8 @@ def chart(axes: Axes, state: WorldState, shown: list[WorldState], track: TrueTra
 
 
 def risk_of(state: WorldState, side: str | None) -> float:
-    """Return the risk of one side."""
-    return next((cue.risk or 0.0 for cue in state.cues if cue.direction == side), 0.0)
+    """Return the risk of one side, NaN while it is not usable."""
+    return next((cue.risk for cue in state.cues if cue.direction == side and cue.usable), None) or math.nan
 
 
 def hide(axes: Axes) -> None:

@@ -1,3 +1,3 @@
 """The version number, for packaging, the command line and written files."""
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"

@@ -6,7 +6,7 @@ NAME = "worldstate_ros"
 
 setup(
     name=NAME,
-    version="0.3.0",
+    version="0.4.0",
     packages=[NAME],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
@@ -14,7 +14,7 @@ setup(
         (f"share/{NAME}/launch", ["launch/worldstate.launch.py"]),
         (f"share/{NAME}/config", ["config/worldstate.yaml"]),
     ],
-    install_requires=["setuptools", "worldstate>=0.3"],
+    install_requires=["setuptools", "worldstate>=0.4"],
     zip_safe=True,
     maintainer="The worldstate authors",
     maintainer_email="worldstate@example.org",
