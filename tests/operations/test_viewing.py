@@ -51,7 +51,7 @@ def reddish(image):
 def test_the_figure_over_time_names_its_panels(log, tmp_path):
     assert main(["log", "plot", str(log), "--out", str(tmp_path / "states.svg")]) == 0
     text = (tmp_path / "states.svg").read_text()
-    for said in ("advisory left", "camera (tall: found)", "what decides, left", "risk, right"):
+    for said in ("advisory left", "camera (tall: found)", "log-odds, left", "risk, right"):
         assert f"<!-- {said} -->" in text
 
 
@@ -142,7 +142,7 @@ def test_the_true_track_is_drawn_in_line_of_sight_and_out_of_it(panels):
     true = TrueTrack(TIME_S, 0.02 * np.arange(40), in_view, np.zeros((40, 2)))
     shown = panels(t0_s=2.2, truth=(true,))
     lines = {line.get_label(): line for line in shown[0].lines}
-    seen = lines["vehicle, truth, in sight"]
+    seen = lines["true vehicle, in sight"]
     assert seen.get_xdata()[np.isfinite(seen.get_ydata())][[0, -1]] == pytest.approx([2.2, 3.6])
     assert lines["line-of-sight entry $T_0$"].get_xdata() == [2.2, 2.2]
     shown[0].figure.draw_without_rendering()
@@ -181,12 +181,12 @@ def test_an_advisory_stands_in_the_row_of_its_side(panels, states):
     assert bar.x0 == pytest.approx(raised[0].stamp_ns / 1e9)
 
 
-def test_what_decides_is_drawn_with_its_threshold_and_onsets(panels, states):
+def test_log_odds_are_drawn_with_threshold_and_onsets(panels, states):
     budgeted = [replace(state, calibrated=True) for state in states]
     terms = [next(cue for cue in state.cues if cue.direction == "left").evidence for state in states]
     lines = {line.get_label(): line for line in panels(budgeted)[2].lines}
     compared = [one.compared_nats for one in terms]
-    assert lines["what decides, left"].get_ydata() == pytest.approx(compared)
+    assert lines["log-odds, left"].get_ydata() == pytest.approx(compared)
     assert lines["threshold"].get_ydata() == pytest.approx([one.threshold_nats for one in terms])
     raised = [any(cue.advisory and cue.direction == "left" for cue in state.cues) for state in states]
     first = raised.index(True)

@@ -1,8 +1,8 @@
-"""`worldstate demo`: one occluded approach, simulated, heard and drawn.
+"""`worldstate demo`: simulate one hidden vehicle, process its sound and draw the result.
 
-Simulate a delivery van that approaches a blind junction, listen to it, and watch it enter the world-state
-before any camera can see it. Prints in a sentence how early it was announced, and leaves timeline.png,
-states.jsonl, log.html to step through in a browser, and summary.json in the output folder.
+A delivery van approaches a blind junction. The command simulates the sound, runs the library on it and prints
+how early the van was announced. It writes the figure timeline.png, the states states.jsonl, the page log.html
+for a browser, and summary.json to the output folder.
 
 example: worldstate demo --out out/demo --seed 7
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 from worldstate import adapters, simulation
 from worldstate.cli.common import listening, output, progress
 
-# Louder than a car, so that the first recording that a newcomer sees is not a marginal one.
+# Louder than a car, so that the first result of a newcomer is a clear case.
 VAN_OVER_CAR_DB = 6.0
 
 NEEDS = ("matplotlib",)
@@ -24,18 +24,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("--out", type=Path, default=Path("out/demo"), help="output folder (default: %(default)s)")
-    add("--seed", type=int, default=1, help="another seed, another recording (default: 1)")
+    add("--seed", type=int, default=1, help="number that determines the recording (default: 1)")
     listening.add_budget_options(parser)
 
 
 def simulate_approach(root: Path, seed: int) -> Path:
-    """Write one recording of a van that `seed` puts at a site and on a side; return its folder."""
+    """Write a recording of one van, with a site and a side drawn with `seed`; return its folder."""
     import numpy as np
 
     from worldstate.simulation.dataset.dataset import write_log
 
     rng = np.random.default_rng(seed)
-    # An easy approach: a van, louder than a car, at 20 to 29 km/h without braking.
+    # An easy approach: 20 to 29 km/h, without braking.
     site, side = str(rng.choice(simulation.SITES)), str(rng.choice(("left", "right")))
     drawn = simulation.draw_settings(site, side, rng)
     louder = replace(drawn.preset, vehicle_level_db=drawn.preset.vehicle_level_db + VAN_OVER_CAR_DB)
@@ -48,7 +48,7 @@ def simulate_approach(root: Path, seed: int) -> Path:
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command."""
     from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.adapters.state_log import read_log
     from worldstate.operations.recordings.recording_report import announcement

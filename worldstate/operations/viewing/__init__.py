@@ -1,1 +1,1 @@
-"""Figures of a run from its snapshots alone: over time, from above, moving."""
+"""Figures and pages of a run, drawn from its snapshots."""

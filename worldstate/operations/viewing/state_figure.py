@@ -1,4 +1,4 @@
-"""A run drawn from its snapshots: over time, over the power of the sound, from above, and moving."""
+"""Figures of the snapshots of a run: over time, from above, and as an animation."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 _WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
 # Longest title in one line above a figure of this width.
 _TITLE_CHARACTERS = 100
-# Below this, odds of one to a thousand, no threshold lies; the first windows of a run reach -20.
+# No threshold is below this (odds of one to a thousand); the first windows of a run reach -20.
 _LOWEST_NATS = -7.0
-# An entity is drawn where it more likely exists than not.
+# An entity is drawn if it exists with at least this probability.
 _LIKELY = 0.5
-# A GIF this large has 576 x 416 pixels: labels of 9 points are still read in a browser.
+# The GIF has 576 x 416 pixels, so that labels of 9 points are readable in a browser.
 _SIZE_IN, _MOVING_DPI = (7.2, 5.2), 80
-# An entity less likely than this is drawn, and not named.
-_TOLD = 0.2
-# Of a sector that was searched, by what was found there.
+# A less likely entity is drawn without its label.
+_LABELLED = 0.2
+# Opacity of a searched sector in which nothing or something was found.
 _NOTHING, _FOUND = 0.15, 0.4
 _LEGEND = (
-    ("hidden vehicle, and risk", style.HIDDEN, 0.4),
+    ("hidden vehicle and its risk", style.HIDDEN, 0.4),
     ("vehicle in view", style.IN_VIEW, 0.35),
     ("advisory", style.DECISION, 1.0),
     ("searched, nothing found", style.SEARCHED, _NOTHING),
@@ -53,7 +53,7 @@ _LEGEND = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundPower:
-    """Steered response power of a recording, one row a hop."""
+    """Steered response power of a recording, one row per hop."""
 
     time_s: FloatArray  # Middle of the window of each row, on the clock of the recording
     azimuths_rad: FloatArray
@@ -66,27 +66,27 @@ def sound_power(
     states: Sequence[WorldState],
     on_second: Callable[[], None] = lambda: None,
 ) -> SoundPower:
-    """Read the power over azimuth of every hop of an open recording, on the clock of its states."""
+    """Return the power over azimuth of every hop of an open recording, on the clock of its states."""
     rows = []
     for block in audio.blocks(audio.sample_rate_hz):
         rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.process(block)]
         on_second()
     rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.finish()]
     ends_s, times_s = np.array([end_s for end_s, _ in rows]), _times(states)
-    # By --start, or of a bag, they begin with the first hop, on a clock that samples do not tell.
+    # With --start, or from a bag, samples do not give the clock of the states: align the first hops.
     if times_s[-1] > ends_s[-1]:
         ends_s += times_s[0] - ends_s[0]
     return _power(ends_s.tolist(), front_end.settings.azimuths_rad(), [row for _, row in rows])
 
 
 def _power(ends_s: Sequence[float], azimuths_rad: FloatArray, rows: Sequence[Float32Array]) -> SoundPower:
-    # Drawn at its end, a window of a second would lag the camera by half of one.
+    # A window of 1 s that is drawn at its end lags the camera by 0.5 s; it is drawn at its middle.
     return SoundPower(np.array(ends_s) - 0.5 * _WINDOW_S, azimuths_rad, np.array(rows))
 
 
 @contextmanager
 def drawn_run(path: Path | None, source: Source, title: str) -> Iterator[Callable[[Step], None]]:
-    """Lend a function that takes the hops of a recording; they are drawn when the block ends, if anywhere."""
+    """Yield a function that collects hops; they are drawn to `path`, if given, when the block ends."""
     states, power, azimuths_rad = list[WorldState](), list[Float32Array](), np.empty(0)
 
     def keep(step: Step) -> None:
@@ -110,22 +110,22 @@ def write_state_figure(
     t0_s: float | None = None,
     truth: Sequence[TrueTrack] = (),
 ) -> None:
-    """Draw azimuths, what was raised and seen, what decides it and the probabilities over time.
+    """Draw azimuths, advisories and looks, the decision values and the probabilities over time.
 
-    A state that is not calibrated has no threshold in the figure, and the title says so.
+    The figure shows no threshold for a state that is not calibrated, and its title states this.
 
     Parameters
     ----------
     states : sequence of WorldState
-        Of one run, at least one.
+        At least one, of one run.
     path : Path
-        Exactly this file.
+        The file to write.
     title : str
         Heading of the figure.
     sound : SoundPower, optional
-        Drawn below the azimuths.
+        Background of the azimuths.
     t0_s : float, optional
-        Line-of-sight entry.
+        Time of line-of-sight entry, seconds.
     truth : sequence of TrueTrack
         True tracks of the vehicles of a simulated recording.
 
@@ -141,7 +141,7 @@ def write_state_figure(
         heights = (1.0 if sound is None else 1.4, 0.42, 0.7, 0.6)
         azimuths, rows, decision, probabilities = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         if sound is not None:
-            label = "power of the sound over its median over azimuth, each window at its middle"
+            label = "sound power divided by its median over azimuth"
             style.draw_power(azimuths, sound.time_s, sound.azimuths_rad, sound.power, label)
         _draw_truth(azimuths, truth)
         _draw_azimuths(azimuths, states)
@@ -164,15 +164,15 @@ def _draw_truth(axes: "Axes", truth: Sequence[TrueTrack]) -> None:
     for track in truth:
         for shown, dashes, name in ((~track.in_view, ":", "out of sight"), (track.in_view, "-", "in sight")):
             line = np.where(shown, np.degrees(track.azimuth_rad), np.nan)
-            axes.plot(track.time_s, line, dashes, color=style.TRUTH, lw=2.0, label=f"vehicle, truth, {name}")
+            axes.plot(track.time_s, line, dashes, color=style.TRUTH, lw=2.0, label=f"true vehicle, {name}")
 
 
 def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
-    """Draw where every entity is in nine of ten cases, and the bearing that was measured."""
+    """Draw the 90 % interval of every entity's azimuth, and the measured bearings."""
     heard = [(seconds(state.stamp_ns), state.bearing.azimuth_rad) for state in states if state.bearing]
     if heard:
         time_s, azimuth_rad = np.array(heard).T
-        axes.plot(time_s, np.degrees(azimuth_rad), ".", color=style.HEARD, ms=4, label="bearing of the sound")
+        axes.plot(time_s, np.degrees(azimuth_rad), ".", color=style.HEARD, ms=4, label="measured bearing")
     tracks: dict[tuple[str, bool], list[tuple[float, ...]]] = {}
     for state in states:
         for one in (part for known in state.entities for part in known.on_each_side()):
@@ -181,20 +181,20 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
                 row = seconds(state.stamp_ns), *np.degrees([one.azimuth_rad, *sector]).tolist()
                 tracks.setdefault((one.id, one.status == "hidden"), []).append(row)
     for (_, hidden), rows in tracks.items():
-        color, label = (style.HIDDEN, "hidden") if hidden else (style.IN_VIEW, "in view")
+        color, label = (style.HIDDEN, "hidden entity") if hidden else (style.IN_VIEW, "entity in view")
         time_s, azimuth, low, high = style.with_gaps(np.array(rows)).T
         axes.fill_between(time_s, low, high, color=color, alpha=0.25, lw=0)
-        axes.plot(time_s, azimuth, color=color, label=f"entity, {label}, nine of ten")
+        axes.plot(time_s, azimuth, color=color, label=f"{label}, 90 % interval")
     axes.set(ylabel="azimuth (deg)\nleft positive", ylim=(-95, 95), yticks=range(-90, 91, 45))
 
 
 def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
-    """Draw a bar while an advisory is out, and a mark for each look that found something or nothing."""
+    """Draw a bar during each advisory, and a mark for each look of a camera."""
     names = [f"advisory {side}" for side in _sides(states)]
     for row, side in enumerate(_sides(states)):
         on = [any(c.direction == side and c.advisory for c in state.cues) for state in states]
         style.draw_bars(axes, _times(states), on, row, style.DECISION)
-    # A look stands in every snapshot until the next one.
+    # A look is part of every snapshot until the next look.
     looks = {(one.sensor, one.stamp_ns, one.found) for state in states for one in state.searched}
     for sensor in sorted({sensor for sensor, _, _ in looks}):
         row = len(names)
@@ -204,7 +204,7 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
         names.append(f"{sensor} (tall: found)")
     foreign = [isinstance(state.domain, Foreign) for state in states]
     deaf = [any(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]
-    for on, color, name in ((foreign, style.HEARD, "foreign sound"), (deaf, "0.5", "could not be heard")):
+    for on, color, name in ((foreign, style.HEARD, "foreign sound"), (deaf, "0.5", "sound not usable")):
         if any(on):
             style.draw_bars(axes, _times(states), on, len(names), color, height=0.6)
             names.append(name)
@@ -212,11 +212,11 @@ def _draw_rows(axes: "Axes", states: Sequence[WorldState]) -> None:
 
 
 def _draw_decision(axes: "Axes", states: Sequence[WorldState]) -> None:
-    """Draw the log-odds that decide, the threshold where a budget stands behind it, and every onset."""
+    """Draw the log-odds of each side, the threshold of calibrated states, and every onset."""
     tables = {side: np.array([_decided(state, side) for state in states]) for side in _sides(states)}
     for dashes, (side, rows) in zip(style.SIDE_DASHES, tables.items(), strict=False):
         time_s, compared, *_ = style.with_gaps(rows).T
-        axes.plot(time_s, compared, dashes, color=style.HIDDEN, label=f"what decides, {side}")
+        axes.plot(time_s, compared, dashes, color=style.HIDDEN, label=f"log-odds, {side}")
     for dashes, rows in zip(style.SIDE_DASHES, tables.values(), strict=False):
         time_s, _, threshold, _ = style.with_gaps(rows).T
         if np.isfinite(threshold).any():
@@ -224,12 +224,12 @@ def _draw_decision(axes: "Axes", states: Sequence[WorldState]) -> None:
         onsets = rows[np.diff(rows[:, 3], prepend=0.0) > 0.0]
         if len(onsets):
             axes.plot(onsets[:, 0], onsets[:, 1], "v", color=style.DECISION, ms=8, label="onset")
-    axes.set(ylabel="log-odds\n(nats)")
+    axes.set(ylabel="decision\n(nats)")
     axes.set_ylim(bottom=max(axes.get_ylim()[0], _LOWEST_NATS))
 
 
 def _decided(state: WorldState, side: str) -> tuple[float, float, float, bool]:
-    """Return the time, what decides, its threshold (NaN without a budget) and whether an advisory stands."""
+    """Return time, log-odds, threshold (NaN if not calibrated) and whether there is an advisory."""
     cue = next((one for one in state.cues if one.direction == side), None)
     if cue is None or cue.evidence is None:
         compared, threshold = math.nan, math.nan
@@ -260,7 +260,7 @@ def _sides(states: Sequence[WorldState]) -> tuple[str, ...]:
 
 
 def _uncalibrated(states: Sequence[WorldState]) -> str:
-    """Return what a title ends in where a state keeps to no false-alarm budget."""
+    """Return the end of the title if states are not calibrated."""
     number = sum(not state.calibrated for state in states)
     return f" ({calibration_words(number, len(states))})" if number else ""
 
@@ -270,7 +270,7 @@ def _times(states: Sequence[WorldState]) -> list[float]:
 
 
 def write_birds_eye(state: WorldState, path: Path, *, title: str = "") -> None:
-    """Draw one snapshot from above, the ego at the bottom, its left to the left."""
+    """Draw one snapshot from above, with the ego at the bottom and its left on the left."""
     with style.figure_file(path, *_SIZE_IN) as figure:
         _draw(figure, state, title)
 
@@ -278,7 +278,7 @@ def write_birds_eye(state: WorldState, path: Path, *, title: str = "") -> None:
 def write_animation(
     states: Sequence[WorldState], path: Path, *, title: str = "", on_frame: Callable[[], None] = lambda: None
 ) -> None:
-    """Draw every snapshot from above into a GIF that plays at the speed of the recording."""
+    """Write a GIF of all snapshots from above; it plays at the speed of the recording."""
     check_gif(path)
     from matplotlib.animation import PillowWriter
     from matplotlib.figure import Figure
@@ -296,7 +296,7 @@ def write_animation(
 
 
 def check_gif(path: Path) -> Path:
-    """Return `path` if it names a GIF; commands call it before their work."""
+    """Return `path` if its suffix is .gif; commands call this before their work."""
     if path.suffix.lower() != ".gif":
         raise InputFileError(path, "expected an animation's name ending in .gif")
     return path
@@ -318,26 +318,26 @@ def _draw(figure: "Figure", state: WorldState, title: str) -> None:
     behind = any(abs(view.sector_rad[0]) > 0.6 * math.pi for view in state.searched)
     axes.set(xlim=(-38, 38), ylim=(-41 if behind else -11, 37), aspect="equal", xticks=(), yticks=())
     axes.spines[:].set_visible(False)
-    said = f"{seconds(state.stamp_ns):.1f} s   {title}{_uncalibrated([state])}"
-    axes.set_title(said, loc="left")
+    words = f"{seconds(state.stamp_ns):.1f} s   {title}{_uncalibrated([state])}"
+    axes.set_title(words, loc="left")
     _draw_legend(axes)
 
 
 def _draw_cue(axes: "Axes", cue: RiskCue) -> None:
-    """Draw the risk, and say it on the cue's own side below the ego, where no sector lies."""
+    """Draw the risk, and write it below the ego on the cue's side, where there is no sector."""
     raised = cue.advisory is not None
     sector = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
     if cue.risk is not None:
         _wedge(axes, sector, CUE_M, style.HIDDEN, 0.05 + 0.5 * cue.risk)
     if raised:
         _wedge(axes, sector, CUE_M, style.DECISION, 1.0, fill=False, lw=3.0, zorder=1.5)
-    said = f"{cue.direction or 'side unknown'}{': ADVISORY' if raised else ''}"
-    said += "" if cue.risk is None else f"\nrisk {cue.risk:.2f}"
-    said += "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
-    said += "".join(f"\nnot usable: {reason}" for reason in cue.why_not)
+    words = f"{cue.direction or 'side unknown'}{': ADVISORY' if raised else ''}"
+    words += "" if cue.risk is None else f"\nrisk {cue.risk:.2f}"
+    words += "" if cue.within is None or "3" not in cue.within else f"\nin 3 s {cue.within['3']:.2f}"
+    words += "".join(f"\nnot usable: {reason}" for reason in cue.why_not)
     x, side = (-37, "left") if cue.azimuth_rad > 0.0 else (37, "right")
     color, weight = (style.DECISION, "bold") if raised else ("0.2", "normal")
-    axes.text(x, -2.5, said, color=color, ha=side, va="top", weight=weight)
+    axes.text(x, -2.5, words, color=color, ha=side, va="top", weight=weight)
 
 
 def _draw_entity(axes: "Axes", entity: Entity) -> None:
@@ -352,7 +352,7 @@ def _draw_entity(axes: "Axes", entity: Entity) -> None:
         axes.plot(*zip(*arc, strict=True), color=color, lw=3, alpha=0.6)
     if entity.position_m is not None:
         axes.plot(-entity.position_m[1], entity.position_m[0], "s", color=color, ms=9)
-    if density >= _TOLD:
+    if density >= _LABELLED:
         x, y = _at(entity.azimuth_rad, SECTOR_M + 5.0)
         text = {"color": color, "fontsize": 9, "ha": "center", "va": "bottom"}
         axes.text(min(max(x, -31.0), 31.0), y, label_of(entity), text)
