@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS := 1
 # Where the surroundings forbid caches of bytecode, every command that a test starts compiles the library anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo check test long slow mutations lint schema figures picture docs locked audit matrix dist clean
+.PHONY: demo check test long slow mutations lint schema figures cards picture docs locked audit matrix dist clean
 
 # One stamp per set of extras, so that `make demo` installs no test packages.
 $(VENV)/bin/python:
@@ -65,6 +65,10 @@ schema: $(VENV)/.core
 # After a change of a template in docs/templates, or `worldstate-lab ... --results docs/evidence/results.json`.
 figures:
 	$(PYTHON) docs/_ext/figures.py
+
+# After a change of a model that ships: its card.
+cards: $(VENV)/.core
+	$(BIN)/python docs/_ext/model_cards.py
 
 # The moving picture of README.md, from the recording of `make demo`.
 picture: demo

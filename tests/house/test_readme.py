@@ -1,11 +1,13 @@
 """README.md: its program runs as printed, its size is limited, and its commands and links exist."""
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
 from worldstate_lab.cli.main import PROGRAM as LABORATORY
 
+import worldstate
 from worldstate.cli.main import PROGRAM
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -78,6 +80,18 @@ def test_every_picture_has_a_description_and_a_caption():
                     else [f"{page.name}: {line}"]
                 )
     assert missing == []
+
+
+def test_page_of_model_cards_matches_the_models():
+    sys.path.append(str(ROOT / "docs" / "_ext"))
+    import model_cards
+
+    assert model_cards.PAGE.read_text("utf-8") == model_cards.page()
+
+
+def test_version_is_the_same_everywhere():
+    cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text("utf-8"), flags=re.MULTILINE)
+    assert cited.group(1) == worldstate.__version__
 
 
 def test_tables_of_commands_are_complete():
