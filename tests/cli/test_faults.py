@@ -170,7 +170,6 @@ def test_reference_boxes_of_one_video_are_not_those_of_several(tmp_path, capsys)
 @pytest.mark.parametrize(
     ("line", "extra"),
     [
-        ("demo --out new", "matplotlib"),
         ("sim make --out new --minutes 1", "matplotlib"),
         ("sim make --out new --static 1 --video", "cv2"),
     ],

@@ -1,8 +1,8 @@
 """`worldstate demo`: simulate one hidden vehicle, process its sound and draw the result.
 
 A delivery van approaches a blind junction. The command simulates the sound, runs the library on it and prints
-how early the van was announced. It writes the figure timeline.png, the states states.jsonl, the page log.html
-for a browser, and summary.json to the output folder.
+how early the van was announced. It writes states.jsonl, the page log.html for a browser, summary.json
+and, if matplotlib is installed, the figure timeline.png to the output folder.
 
 example: worldstate demo --out out/demo --seed 7
 """
@@ -13,11 +13,10 @@ from pathlib import Path
 
 from worldstate import adapters, simulation
 from worldstate.cli.common import listening, output, progress
+from worldstate.ground.extras import has_extra
 
 # Louder than a car, so that the first result of a newcomer is a clear case.
 VAN_OVER_CAR_DB = 6.0
-
-NEEDS = ("matplotlib",)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -59,11 +58,12 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     folder = simulate_approach(out / "recording", arguments.seed)
     source = adapters.open_source(folder, budget=arguments.budget, alpha=arguments.alpha)
     title = f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}"
-    with drawn_run(out / "timeline.png", source, title) as draw:
+    figure = out / "timeline.png" if has_extra("matplotlib") else None
+    with drawn_run(figure, source, title) as draw:
         report = listening.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
     states = [state for _, state in read_log(out / "states.jsonl")]
     truth = read_true_tracks(folder)
     write_log_page(out / "log.html", page_data(states, title=title, t0_s=source.t0_s, truth=truth))
     output.write_report(out / "summary.json", report.to_dict())
     told = announcement(states, truth, "a van")
-    return output.CommandResult(report.to_dict(), lines=["", f"see {out / 'timeline.png'}", told])
+    return output.CommandResult(report.to_dict(), lines=["", f"see {figure or out / 'log.html'}", told])
