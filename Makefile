@@ -3,15 +3,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 SHELL := /bin/sh
 
-# Two test processes of one BLAS thread each: on two cores more threads only wait for one another.
+# Two test processes with one BLAS thread each: on two cores, more threads only wait for each other.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
-# Where the surroundings forbid caches of bytecode, every command that a test starts compiles the library anew.
+# If the environment forbids bytecode caches, every command of a test compiles the library again.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo check test long slow mutations lint schema figures cards picture docs locked audit matrix dist clean
 
-# One stamp per set of extras, so that `make demo` installs no test packages.
+# One stamp file per set of extras, so that `make demo` does not install test packages.
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
@@ -26,8 +26,8 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml lab/pyproject.toml
 demo: $(VENV)/.core
 	$(BIN)/worldstate demo --out out/demo
 
-# While working: the core first, so that what it breaks shows within seconds, then the rest of what every commit
-# can break. Types are fast with a warm cache.
+# For use during work: the core's tests come first, so that a defect there appears within seconds. The type check
+# is fast with a warm cache.
 check: $(VENV)/.test
 	$(BIN)/python -m pytest -x -n 2 --dist loadgroup tests/core
 	$(BIN)/ruff check .
@@ -35,18 +35,18 @@ check: $(VENV)/.test
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -x -n 2 --dist loadgroup tests/frontend tests/ground tests/house/test_house.py tests/house/test_readme.py
 
-# The library's tests and the laboratory's.
+# The tests of the library and of the laboratory.
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
-# Whole commands, pages that are run as they stand, streets that are simulated: CI runs these as well.
+# Complete commands, the programs of the pages, and simulated streets. CI also runs these.
 long: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "long and not slow"
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --hypothesis-profile=anew
 
-# Whether the core's tests notice an error of sign, factor or order, and a published quantity that stands still.
+# Check that the core's tests detect a wrong sign, factor or order, and a published quantity that never changes.
 mutations: $(VENV)/.test
 	$(BIN)/python tests/core/run_mutations.py
 	$(BIN)/python tests/core/run_mutations.py --freeze
@@ -58,7 +58,7 @@ lint: $(VENV)/.test
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest tests/house/test_docs.py -k "who or lines_of_a_page or glossary"
 
-# After a change of the types of snapshots or scenes.
+# For use after a change of the types of snapshots or scenes.
 schema: $(VENV)/.core
 	$(BIN)/python docs/_ext/json_schema.py
 
@@ -66,15 +66,15 @@ schema: $(VENV)/.core
 figures:
 	$(PYTHON) docs/_ext/figures.py
 
-# After a change of a model that ships: its card.
+# Write the cards of the models, after a change of a model that ships.
 cards: $(VENV)/.core
 	$(BIN)/python docs/_ext/model_cards.py
 
-# The moving picture of README.md, from the recording of `make demo`.
+# Draw the moving picture of README.md from the recording of `make demo`.
 picture: demo
 	$(BIN)/python tools/picture.py out/demo docs/guide/approach.webp
 
-# Warnings are errors, and a page that would load something from the network is one too.
+# Warnings are errors, and so is a page that loads a file from the network.
 $(VENV)/.docs: $(VENV)/bin/python pyproject.toml
 	$(BIN)/pip install -q --disable-pip-version-check -e '.[docs]'
 	touch $@ $(VENV)/.core
@@ -84,25 +84,25 @@ docs: $(VENV)/.docs
 	@! grep -rnE '(src|srcset)="https?:|<link[^>]*href="https?:|url\(.?https?:|@import' out/docs --include='*.html' --include='*.css'
 	@echo out/docs/index.html
 
-# What is installed here becomes what CI tests; from an empty environment, `make clean` first, the newest.
+# Record the installed versions as those that CI tests. For the newest versions, run `make clean` first.
 locked: $(VENV)/.test $(VENV)/.docs
 	head -2 locked.txt > out.locked
 	$(BIN)/pip freeze --all --exclude-editable | grep -v '^pip==' | grep '==' >> out.locked
 	mv out.locked locked.txt
 
-# Known vulnerabilities of those versions. It needs an index of advisories: a version that could not be looked up
-# is a failure, and so is a list without any, else an audit of nothing would pass.
+# Compare those versions with known vulnerabilities. A version that the index of advisories does not contain is a
+# failure; so is an empty list.
 audit:
 	grep -q '^[A-Za-z].*==' locked.txt
 	$(PYTHON) -m venv out/audit
 	out/audit/bin/pip install -q --disable-pip-version-check pip-audit
 	out/audit/bin/pip-audit --strict -r locked.txt --no-deps --disable-pip
 
-# Oldest and newest releases of what the library needs, on every Python from 3.11 to 3.13 that is here.
+# Test with the oldest and newest releases of the dependencies, on every installed Python from 3.11 to 3.13.
 matrix:
 	.ci/matrix
 
-# Wheel and sdist, tried in an empty environment.
+# Build wheel and sdist, and test them in an empty environment.
 dist:
 	.ci/dist $(PYTHON)
 
