@@ -76,7 +76,7 @@ def _record(cls: Any, defs: dict[str, Schema]) -> Schema:
         stamp = {"name": {"const": layout.schema}, "version": version}
         properties["schema"] = {"type": "object", "properties": stamp, "required": list(stamp)}
     required = list(properties)
-    for member in fields(cls):
+    for member in [one for one in fields(cls) if one.init]:
         told = {"description": said[member.name]} if member.name in said else {}
         properties[member.name] = _of(hints[member.name], defs) | told
         required += [] if member.metadata.get("added") else [member.name]

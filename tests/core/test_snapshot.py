@@ -1,6 +1,7 @@
 """Snapshots: what is written is read back, order carries no meaning, and damage is refused by name."""
 
 import copy
+import html
 import json
 import math
 import sys
@@ -25,7 +26,7 @@ from worldstate.abduction.road_users import Familiar, Foreign
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.ground import LEAST_HEARD, NotUsable
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
-from worldstate.measurement import Heard
+from worldstate.measurement import Bearing, Heard
 from worldstate.state import (
     Advisory,
     Budget,
@@ -47,9 +48,12 @@ from worldstate.state import (
     Visibility,
     WorldState,
     snapshot_schema,
+    to_dataframe,
 )
+from worldstate.state import views as state_views
 from worldstate.state.cue import WhyNot
 from worldstate.state.sensor import MASKED
+from worldstate.state.views import headline
 from worldstate.state.world_state import judged
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "docs" / "_ext"))
@@ -210,6 +214,96 @@ def test_order_carries_no_meaning(state, random):
     shuffled = replace(state, **parts)
     assert shuffled == state
     assert shuffled.to_json() == state.to_json()
+
+
+@given(states)
+def test_a_printed_state_has_three_lines_and_every_advisory_fits_or_is_cut(state):
+    printed = str(state)
+    assert len(printed) <= 240
+    assert len(printed.splitlines()) <= 3
+    assert printed == repr(state)
+    assert html.unescape(state._repr_html_()) == f"<pre>{printed}</pre>"
+    advised = [cue for cue in state.cues if cue.direction and cue.advisory]
+    assert ("ADVISORY" in printed) == bool(advised and state.no_model is None)
+
+
+def test_a_printed_state_reads_as_a_sentence():
+    advised = RiskCue(
+        "right", math.radians(-48), 0.3, 0.87, 0.9, 0.9, 3.0, None, Advisory(5_000_000_000, 6_500_000_000),
+        entity_id="car", time_to_visible_s=(0.9, 1.8, 3.2), within={"3": 0.73}, usable=True, why_not=(),
+    )  # fmt: skip
+    other = replace(advised, direction="left", azimuth_rad=0.8, risk=0.04, advisory=None, entity_id=None)
+    car = Entity(
+        "car", "hidden", 0.9, 0.87, math.radians(-48), 0.3, 0, 0, (Classification("car", 0.8),)
+    )  # fmt: skip
+    state = WorldState(5_500_000_000, 45, entities=(car,), cues=(advised, other))
+    line = "5.5 s  right: ADVISORY, risk 0.87, hidden car at 48 degrees right, in view in 1.8 s (0.9 to 3.2)"
+    assert str(state) == line
+    assert headline(state) == "Right: a vehicle is hidden, 73 % to appear within 3 s."
+    unheard = replace(advised, usable=False, why_not=("unheard",))
+    assert "ADVISORY (not usable: unheard), risk" in str(replace(state, cues=(unheard, other)))
+    quiet = replace(state, cues=(replace(advised, advisory=None, risk=0.12), other))
+    assert str(quiet) == "5.5 s  no advisory, risk 0.04 left, 0.12 right"
+    assert headline(quiet) == "No advisory. The highest risk is 0.12, on the right."
+    seen = replace(quiet, entities=(replace(car, status="visible", azimuth_rad=math.radians(12)),))
+    assert str(seen).splitlines()[1] == "       in view: car at 12 degrees left"
+    bearing = Bearing(math.radians(-48), 0.1, 2.0)
+    reason = NotUsable("no model was made for this array of 4 microphones")
+    without = WorldState(5_500_000_000, 45, bearing=bearing, no_model=reason)
+    assert str(without) == f"5.5 s  sound from 48 degrees right; no risk: {reason.reason}"
+    assert headline(without) == "A sound comes from 48 degrees right; its risk cannot be stated."
+
+
+@given(states)
+def test_sides_are_found_by_name_and_an_advisory_begins_in_one_state(state):
+    for cue in state.cues:
+        assert cue.direction is None or state.cues[cue.direction].direction == cue.direction
+        assert cue.began == (cue.advisory is not None and cue.advisory.since_ns == state.stamp_ns)
+    assert state.cues[:] == tuple(state.cues)
+    assert (state.left, state.right) == (None, None) or {"left", "right"} & {c.direction for c in state.cues}
+    with pytest.raises(InvalidArgumentError, match="cues: expected one of"):
+        state.cues["a side of another street"]
+
+
+def test_an_advisory_begins_in_one_state_only():
+    advisory = Advisory(since_ns=10**8, valid_until_ns=2 * 10**9)
+    cue = RiskCue("left", 0.9, 0.3, 0.8, 0.95, 0.97, 3.1, None, advisory)
+    first, second = (WorldState(stamp_ns, 1, cues=(cue,)) for stamp_ns in (10**8, 2 * 10**8))
+    assert (cue.began, first.left.began, second.left.began, first.right) == (False, True, False, None)
+    assert WorldState.from_json(first.to_json()).left.began
+    assert copy.deepcopy(first).cues["left"].began
+    assert (first.time_s, round(first.left.azimuth_deg, 3)) == (0.1, 51.566)
+
+
+class Table:
+    """Stands in for the only part of pandas that is used."""
+
+    @staticmethod
+    def DataFrame(rows, columns):  # noqa: N802
+        return [dict(zip(columns, row, strict=True)) for row in rows]
+
+
+@given(st.lists(states, max_size=3))
+@settings(max_examples=20)
+def test_a_table_has_a_row_for_every_side_of_every_state(these):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(state_views, "optional", {"pandas": Table}.__getitem__)
+        rows = to_dataframe(iter(these))
+    expected = [(state.time_s, side) for state in these for side in (sides_of(state) or [None])]
+    assert [(row["time_s"], row["side"]) for row in rows] == expected
+    told = [cue for state in these for cue in state.cues if cue.direction]
+    assert [row["risk"] for row in rows if row["side"]] == [cue.risk for cue in told]
+    assert sum(bool(row["began"]) for row in rows) == sum(cue.began for cue in told)
+
+
+def sides_of(state):
+    return [cue.direction for cue in state.cues if cue.direction]
+
+
+def test_a_table_without_pandas_names_what_to_install(monkeypatch):
+    monkeypatch.setattr("worldstate.ground.extras.find_spec", lambda name: None)
+    with pytest.raises(WorldstateError, match=r"pip install 'worldstate\[pandas\]'"):
+        to_dataframe([])
 
 
 def full_state():

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import soundfile
+from matplotlib import pyplot
 from matplotlib.figure import Figure
 from PIL import Image
 from scripted_states import scripted_states
@@ -53,6 +54,15 @@ def test_the_figure_over_time_names_its_panels(log, tmp_path):
     text = (tmp_path / "states.svg").read_text()
     for said in ("advisory left", "camera (tall: found)", "log-odds, left", "risk, right"):
         assert f"<!-- {said} -->" in text
+
+
+def test_a_state_plots_itself_on_new_and_on_given_axes(states):
+    axes = states[0].plot()
+    figure, given = pyplot.subplots()
+    assert states[0].plot(given) is given
+    assert axes.figure is not figure
+    assert axes.get_title(loc="left").startswith(f"{states[0].time_s:.1f} s")
+    pyplot.close("all")
 
 
 def test_who_is_hidden_on_the_left_is_drawn_on_the_left(states, tmp_path):

@@ -13,7 +13,7 @@ from worldstate.belief.side_belief import SideBelief
 from worldstate.ground import InvalidArgumentError, NotUsable, in_range, integer_ns, nanoseconds, replaced
 from worldstate.ground.serialisation import ADDED, Layout, decode, encode
 from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sighting
-from worldstate.state import Context, Event, Priors, WorldState
+from worldstate.state import Context, Cues, Event, Priors, WorldState
 from worldstate.state.world_state import judged
 
 from .birth_death import events_between, published
@@ -110,13 +110,14 @@ class WorldFilter:
         # The last step's relations stay valid until time passes or odometry moves the ego vehicle.
         is_fresh = memory is self._lag.latest and memory.ego is None
         sounds, before = sound_entities(memory.sounds, settings), last.predicted or memory.sides.hypotheses
+        cues = SideAlarms(memory, model).cues(sensors) if self.no_model is None else sound_cues(sounds)
         state = WorldState(
             stamp_ns=memory.stamp_ns,
             seq=memory.counts.measurements,
             entities=(*entities_of(tracks, memory, model.site), *sounds),
             relations=memory.relations if is_fresh else relations_at(memory, tracks, model),
             context=context if self.no_model else replaced(context, priors=Priors(*before)),
-            cues=SideAlarms(memory, model).cues(sensors) if self.no_model is None else sound_cues(sounds),
+            cues=Cues(cues),
             calibrated=self.policy.alpha > 0.0,
             bearing=last.bearing,
             domain=last.domain,

@@ -19,6 +19,7 @@ EXTRAS = {
     "networkx": ("networkx", "graph"),
     "onnxruntime": ("onnxruntime", "onnx"),
     "osi3": ("osi-python", "osi"),
+    "pandas": ("pandas", "pandas"),
     "pyarrow": ("pyarrow", "corpus"),
     "rerun": ("rerun-sdk", "rerun"),
     "rich": ("rich", "cli"),

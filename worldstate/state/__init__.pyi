@@ -3,8 +3,10 @@ from .context import Occluder as Occluder
 from .context import Priors as Priors
 from .context import Rates as Rates
 from .context import blind_corner as blind_corner
+from .context import corner_at as corner_at
 from .cue import Advisory as Advisory
 from .cue import Budget as Budget
+from .cue import Cues as Cues
 from .cue import EvidenceTerms as EvidenceTerms
 from .cue import Held as Held
 from .cue import RiskCue as RiskCue
@@ -19,5 +21,6 @@ from .sensor import Delivery as Delivery
 from .sensor import Hearing as Hearing
 from .sensor import SearchedView as SearchedView
 from .sensor import SensorHealth as SensorHealth
+from .views import to_dataframe as to_dataframe
 from .world_state import WorldState as WorldState
 from .world_state import snapshot_schema as snapshot_schema

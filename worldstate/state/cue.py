@@ -1,11 +1,13 @@
 """Predictive cues: the calibrated, direction-resolved risk of a hidden road user."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Literal, SupportsIndex, TypeAlias, overload
 
 from worldstate.abduction.sequence.sequence_model import AlarmPromise
-from worldstate.ground import InvalidArgumentError
+from worldstate.ground import InvalidArgumentError, replaced
+from worldstate.ground.checks import one_of
 from worldstate.ground.serialisation import ADDED, Count, Layout, Probability
 
 from .context import Priors
@@ -271,7 +273,58 @@ class RiskCue:
     # Nothing vouches for a cue until `judged` has looked at the snapshot that it stands in.
     usable: bool = False
     why_not: tuple[WhyNot, ...] = ("uncalibrated",)
+    # Not written: the state that holds the cue sets it from `advisory` and its own time.
+    began: bool = field(default=False, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.usable is bool(self.why_not):
             raise InvalidArgumentError(f"usable: expected {not self.usable} with why_not {self.why_not}")
+
+    @property
+    def azimuth_deg(self) -> float:
+        """Azimuth, degrees, left positive."""
+        return math.degrees(self.azimuth_rad)
+
+    def at(self, stamp_ns: int) -> "RiskCue":
+        """Return the cue of a state of this time, with `began` set."""
+        began = self.advisory is not None and self.advisory.since_ns == stamp_ns
+        if began is self.began:
+            return self
+        cue = replaced(self)
+        object.__setattr__(cue, "began", began)
+        return cue
+
+
+class Cues(tuple[RiskCue, ...]):
+    """The cues of a state in order of direction; a direction is an index as well.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If no cue has the direction: without a model, or before the first measurement, none has one.
+
+    Examples
+    --------
+    >>> cues = Cues([RiskCue("left", 0.9, 0.3, 0.8, 0.95, 0.97, 3.1, Priors(0.9, 0.05, 0.05))])
+    >>> cues["left"].risk, cues[0] is cues["left"], [cue.direction for cue in cues]
+    (0.8, True, ['left'])
+    """
+
+    __slots__ = ()
+
+    @overload
+    def __getitem__(self, key: SupportsIndex | str, /) -> RiskCue: ...
+    @overload
+    def __getitem__(self, key: slice, /) -> tuple[RiskCue, ...]: ...
+    def __getitem__(self, key: SupportsIndex | str | slice, /) -> RiskCue | tuple[RiskCue, ...]:
+        if not isinstance(key, str):
+            return super().__getitem__(key)
+        by_direction = {cue.direction: cue for cue in self if cue.direction is not None}
+        return by_direction[one_of("cues", key, by_direction or ["no direction"])]
+
+
+# Readers and writers of snapshots, which follow the type hints, treat the cues as any other list.
+if TYPE_CHECKING:
+    CueList: TypeAlias = Cues
+else:
+    CueList = tuple[RiskCue, ...]

@@ -1,5 +1,6 @@
 """Entities: road users of the world-state, seen or hidden; their relations, and events in their life."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, TypeAlias
@@ -187,6 +188,11 @@ class Entity:
     forecast: Mapping[str, tuple[float, float]] | None = None
     azimuth_source: AzimuthSource | None = None
     sides: tuple[SideShare, ...] = ()
+
+    @property
+    def azimuth_deg(self) -> float:
+        """Azimuth, degrees, left positive."""
+        return math.degrees(self.azimuth_rad)
 
     def on_each_side(self) -> tuple["Entity", ...]:
         """Return an entity of unknown side once for each, as likely as it is there; any other as it is.

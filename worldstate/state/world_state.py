@@ -2,26 +2,30 @@
 
 import json
 from dataclasses import dataclass, field
+from html import escape
+from importlib import import_module
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
 from worldstate.abduction.road_users import DomainVerdict, Foreign
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
-from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable, replaced
+from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable, replaced, seconds
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import ADDED, Layout, decode, decode_json, encode
 from worldstate.measurement.measurement import Bearing
 
 from .context import Context
-from .cue import Budget, RiskCue, WhyNot
+from .cue import Budget, CueList, Cues, RiskCue, WhyNot
 from .entity import EGO, Entity, Event, Relation
 from .sensor import MASKED, Delivery, Ego, Hearing, SearchedView, SensorHealth
+from .views import text
 
 if TYPE_CHECKING:
     import networkx as nx
+    from matplotlib.axes import Axes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class WorldState:
     """S_t = {entities, relations, context, cues}, immutable and in canonical order.
 
@@ -91,7 +95,7 @@ class WorldState:
     entities: tuple[Entity, ...] = ()
     relations: tuple[Relation, ...] = ()
     context: Context = field(default_factory=Context)
-    cues: tuple[RiskCue, ...] = ()
+    cues: CueList = field(default_factory=Cues)
     frame_id: str = "base_link"
     clock: str = "media"
     calibrated: bool = False
@@ -115,7 +119,28 @@ class WorldState:
         object.__setattr__(self, "entities", tuple(entities))
         object.__setattr__(self, "relations", tuple(relations))
         cues = sorted(self.cues, key=lambda cue: (cue.direction or "", cue.azimuth_rad))
-        object.__setattr__(self, "cues", tuple(cues))
+        object.__setattr__(self, "cues", Cues(cue.at(self.stamp_ns) for cue in cues))
+
+    def __repr__(self) -> str:
+        return text(self)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(text(self))}</pre>"
+
+    @property
+    def time_s(self) -> float:
+        """Time of the state on `clock`, s."""
+        return seconds(self.stamp_ns)
+
+    @property
+    def left(self) -> RiskCue | None:
+        """Cue of the approach side "left"; None if no cue has this direction, as without a model."""
+        return next((cue for cue in self.cues if cue.direction == "left"), None)
+
+    @property
+    def right(self) -> RiskCue | None:
+        """Cue of the approach side "right"; None if no cue has this direction, as without a model."""
+        return next((cue for cue in self.cues if cue.direction == "right"), None)
 
     @property
     def risk(self) -> float | None:
@@ -147,6 +172,33 @@ class WorldState:
             names = ("probability", "stamp_ns", "since_ns", "until_ns")
             graph.add_edge(edge.src, edge.dst, key=edge.kind, **{name: getattr(edge, name) for name in names})
         return graph
+
+    def plot(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the state from above, the ego vehicle at the bottom and its left on the left.
+
+        Parameters
+        ----------
+        axes : matplotlib.axes.Axes, optional
+            Drawn on; without it on a new figure of pyplot.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            ``axes.figure.savefig("state.png")`` writes it to a file.
+
+        Raises
+        ------
+        MissingExtraError
+            If matplotlib is not installed.
+
+        Examples
+        --------
+        >>> WorldState(1_500_000_000, 0).plot().get_title(loc="left")[:5]
+        '1.5 s'
+        """
+        # The drawing lies in a higher layer, which only this call needs.
+        drawn: Axes = import_module("worldstate.operations.viewing.state_figure").draw_state(self, axes)
+        return drawn
 
     def to_dict(self) -> dict[str, Any]:
         """Return the snapshot as JSON-able values; unknown is None."""

@@ -26,7 +26,6 @@ from worldstate.state import Entity, RiskCue, WorldState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
 # Longest title in one line above a figure of this width.
@@ -272,7 +271,7 @@ def _times(states: Sequence[WorldState]) -> list[float]:
 def write_birds_eye(state: WorldState, path: Path, *, title: str = "") -> None:
     """Draw one snapshot from above, with the ego at the bottom and its left on the left."""
     with style.figure_file(path, *_SIZE_IN) as figure:
-        _draw(figure, state, title)
+        _draw(figure.subplots(), state, title)
 
 
 def write_animation(
@@ -290,7 +289,7 @@ def write_animation(
         with writer.saving(figure, str(temporary), dpi=_MOVING_DPI):
             for state in states:
                 figure.clear()
-                _draw(figure, state, title)
+                _draw(figure.subplots(), state, title)
                 writer.grab_frame()
                 on_frame()
 
@@ -302,8 +301,18 @@ def check_gif(path: Path) -> Path:
     return path
 
 
-def _draw(figure: "Figure", state: WorldState, title: str) -> None:
-    axes = figure.subplots()
+def draw_state(state: WorldState, axes: "Axes | None" = None) -> "Axes":
+    """Draw a snapshot from above on axes, by default of a new figure of pyplot; return the axes."""
+    with style.figure_style():
+        if axes is None:
+            from matplotlib import pyplot
+
+            axes = pyplot.figure(figsize=_SIZE_IN, layout="constrained").subplots()
+        _draw(axes, state, "")
+    return axes
+
+
+def _draw(axes: "Axes", state: WorldState, title: str) -> None:
     for occluder in state.context.occluders:
         _wedge(axes, hidden_sector(occluder), SECTOR_M, "0.5", 0.13)
         ends = (_at(occluder.edge_azimuth_rad, distance_m) for distance_m in (4.0, SECTOR_M))
