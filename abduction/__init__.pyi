@@ -4,6 +4,7 @@ from .co_evidence import Present as Present
 from .co_evidence import Unqueried as Unqueried
 from .cueing.cueing_policy import CueingPolicies as CueingPolicies
 from .cueing.cueing_policy import CueingPolicy as CueingPolicy
+from .cueing.cueing_policy import uncalibrated_policy as uncalibrated_policy
 from .cueing.risk_map import ReliabilityCurve as ReliabilityCurve
 from .cueing.risk_map import RiskMap as RiskMap
 from .cueing.risk_map import brier_score as brier_score

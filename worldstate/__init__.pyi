@@ -1,14 +1,16 @@
+# Verbs first; isort would mix them with the types.
+from .adapters.listener import listen as listen
+from .operations.corpus.corpus_run import hear as hear
+from .state.views import to_dataframe as to_dataframe
+
+# isort: split
 from .abduction.co_evidence import Absent as Absent
 from .abduction.co_evidence import Present as Present
 from .abduction.co_evidence import Unqueried as Unqueried
-from .abduction.cueing.cueing_policy import uncalibrated_policy as uncalibrated_policy
 from .abduction.evidence import SignatureEvidence as SignatureEvidence
-from .adapters.acoustic import AcousticAdapter as AcousticAdapter
 from .adapters.camera.detections import DetectionFrame as DetectionFrame
 from .adapters.camera.pinhole import PinholeCamera as PinholeCamera
-from .adapters.files.checkpoint_file import Checkpoint as Checkpoint
 from .adapters.listener import Listener as Listener
-from .adapters.listener import listen as listen
 from .adapters.source import ListenSettings as ListenSettings
 from .belief.settings import FilterSettings as FilterSettings
 from .core.filter import WorldFilter as WorldFilter
@@ -16,18 +18,10 @@ from .frontend.array.microphone_array import MicrophoneArray as MicrophoneArray
 from .ground.errors import WorldstateError as WorldstateError
 from .ground.values import NotUsable as NotUsable
 from .ground.values import nanoseconds as nanoseconds
-from .measurement.measurement import Approach as Approach
-from .measurement.measurement import Bearing as Bearing
-from .measurement.measurement import CoEvidenceChannel as CoEvidenceChannel
 from .measurement.measurement import Measurement as Measurement
 from .measurement.measurement import Sighting as Sighting
 from .measurement.odometry import Odometry as Odometry
-from .measurement.position import Position as Position
-from .measurement.position import PositionScan as PositionScan
-from .operations.corpus.corpus_run import hear as hear
 from .state.context import Context as Context
-from .state.context import corner_at as corner_at
-from .state.entity import Entity as Entity
 from .state.world_state import WorldState as WorldState
 
 __version__: str

@@ -30,8 +30,6 @@ import numpy as np
 
 from worldstate import (
     Absent,
-    AcousticAdapter,
-    Bearing,
     DetectionFrame,
     MicrophoneArray,
     NotUsable,
@@ -43,8 +41,10 @@ from worldstate import (
     WorldFilter,
     WorldState,
     nanoseconds,
-    uncalibrated_policy,
 )
+from worldstate.abduction import uncalibrated_policy
+from worldstate.adapters import AcousticAdapter
+from worldstate.measurement import Bearing
 
 RATE_HZ = 16_000
 IMAGE_PX = (700, 300)

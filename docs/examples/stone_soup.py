@@ -10,7 +10,8 @@ import numpy as np
 from stonesoup.models.measurement.linear import LinearGaussian
 from stonesoup.types.detection import Detection
 
-from worldstate import Position, PositionScan, WorldFilter
+from worldstate import WorldFilter
+from worldstate.measurement import Position, PositionScan
 
 START = datetime(2026, 1, 1)
 RECEIVER = LinearGaussian(ndim_state=4, mapping=(0, 2), noise_covar=np.diag([0.25, 0.25]))  # of x, vx, y, vy

@@ -20,9 +20,6 @@ from dataclasses import dataclass, replace
 
 from worldstate import (
     Absent,
-    Approach,
-    Bearing,
-    CoEvidenceChannel,
     FilterSettings,
     Measurement,
     NotUsable,
@@ -33,8 +30,9 @@ from worldstate import (
     WorldFilter,
     WorldState,
     nanoseconds,
-    uncalibrated_policy,
 )
+from worldstate.abduction import uncalibrated_policy
+from worldstate.measurement import Approach, Bearing, CoEvidenceChannel
 
 DIRECTIONS = ("left", "right")
 # Assumed: shadowing repeats for 0.3 s, 2 m at the pace of a side street.

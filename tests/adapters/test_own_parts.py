@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from scripted_states import scripted_states
 
-from worldstate import AcousticAdapter
-from worldstate.adapters import write_array_xml
+from worldstate.adapters import AcousticAdapter, write_array_xml
 from worldstate.adapters.live.live_sensors import ImageLooks, image_channel
 from worldstate.adapters.own_parts import OwnDetector, installed, of_part
 from worldstate.cli.main import main

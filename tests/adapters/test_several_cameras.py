@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate import Bearing, NotUsable, Present, Unqueried
+from worldstate import NotUsable, Present, Unqueried
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
+from worldstate.measurement import Bearing
 
 NOW, COARSE = 1_000_000_000, NotUsable("coarse")
 EMPTY = DetectionFrame(np.empty((0, 4)), np.empty(0), ())

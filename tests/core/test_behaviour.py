@@ -9,8 +9,6 @@ import pytest
 
 from worldstate import (
     Absent,
-    Approach,
-    Bearing,
     Context,
     Measurement,
     NotUsable,
@@ -22,7 +20,7 @@ from worldstate import (
     WorldstateError,
 )
 from worldstate.abduction import log_lambda
-from worldstate.measurement import Look
+from worldstate.measurement import Approach, Bearing, Look
 
 NOTHING, UNASKED = NotUsable("-"), Unqueried("-")
 EVEN = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)

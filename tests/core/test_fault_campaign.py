@@ -10,8 +10,6 @@ import pytest
 from snapshot_laws import broken_laws
 
 from worldstate import (
-    Approach,
-    Bearing,
     Context,
     Measurement,
     NotUsable,
@@ -26,7 +24,17 @@ from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.cli.demo import simulate_approach
-from worldstate.measurement import CameraLook, Heard, Look, Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement import (
+    Approach,
+    Bearing,
+    CameraLook,
+    Heard,
+    Look,
+    Position,
+    PositionScan,
+    SearchedSector,
+    Sector,
+)
 from worldstate.measurement.odometry import EgoPose, Odometry
 from worldstate.state import Delivery
 from worldstate.state.context import corner_at

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate import Approach, Bearing, Context, FilterSettings, Measurement, Sighting, WorldFilter
+from worldstate import Context, FilterSettings, Measurement, Sighting, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
@@ -20,7 +20,7 @@ from worldstate.core.acoustic_update import acoustic_update
 from worldstate.core.site_model import site_geometry_of
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError
 from worldstate.ground.values import NotUsable
-from worldstate.measurement import Look
+from worldstate.measurement import Approach, Bearing, Look
 from worldstate.state import Priors
 
 QUIET = (0.1, 0.1, 0.1, 0.7)

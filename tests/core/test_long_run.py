@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldstate import Bearing, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate import Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.measurement import Look, Position, PositionScan
+from worldstate.measurement import Bearing, Look, Position, PositionScan
 
 HOP_NS, HOPS_PER_HOUR = 10**8, 36_000
 SHARE = np.array([0.004] * len(COMING_S) + [0.05, 0.05, 0.05, 0.05, 0.05, 0.714])

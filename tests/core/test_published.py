@@ -10,22 +10,22 @@ from published_quantities import quantities
 from watched_street import START_NS as WATCHED_NS
 from watched_street import arrival, false_alarms
 
-from worldstate import (
-    Bearing,
-    Context,
-    Measurement,
-    NotUsable,
-    Sighting,
-    SignatureEvidence,
-    WorldFilter,
-    WorldState,
-)
+from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.road_users import Familiar, Foreign, WarningSignal
 from worldstate.abduction.sequence.sequence_model import GROUPS, AlarmPromise, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.measurement import Approach, Heard, Look, Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement import (
+    Approach,
+    Bearing,
+    Heard,
+    Look,
+    Position,
+    PositionScan,
+    SearchedSector,
+    Sector,
+)
 from worldstate.measurement.odometry import EgoPose, Odometry
 from worldstate.state import Priors, Rates
 from worldstate.state.context import corner_at, open_side

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from worldstate import (
     Absent,
-    Bearing,
     Context,
     Measurement,
     NotUsable,
@@ -25,7 +24,7 @@ from worldstate import (
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.measurement import Odometry, Position, PositionScan, SearchedSector, Sector
+from worldstate.measurement import Bearing, Odometry, Position, PositionScan, SearchedSector, Sector
 from worldstate.measurement.measurement import CameraLook, Look
 from worldstate.state import blind_corner
 from worldstate.state.context import corner_at

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from worldstate_lab.cli.main import PROGRAM as LABORATORY
 
+import worldstate
 from worldstate.cli.main import PROGRAM, current_words
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +36,18 @@ def test_every_exported_name_has_an_example_that_runs(name):
 
 
 def test_all_names_together_can_be_learned():
+    assert len(worldstate.__all__) <= 25
     assert sum(map(len, reference.exports().values())) <= 250
+
+
+@pytest.mark.parametrize("name", worldstate._FORMER)
+def test_a_name_that_has_moved_warns_and_names_its_package(name):
+    with pytest.warns(DeprecationWarning, match=rf"^worldstate\.{name} is worldstate\.\w+\.{name}$") as caught:
+        value = getattr(worldstate, name)
+    assert caught[0].filename == __file__
+    package = str(caught[0].message).split(" is ")[1].rpartition(".")[0]
+    assert getattr(importlib.import_module(package), name) is value
+    assert name in importlib.import_module(package).__all__
 
 
 def test_a_vehicle_is_not_who():

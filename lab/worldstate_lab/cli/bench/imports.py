@@ -15,7 +15,7 @@ STATEMENTS = (
     "import worldstate",
     "import worldstate; worldstate.WorldFilter",
     "import worldstate; worldstate.WorldFilter().predict(0.1).state",
-    "import worldstate; worldstate.AcousticAdapter",
+    "import worldstate.adapters; worldstate.adapters.AcousticAdapter",
     "import worldstate; worldstate.listen",
     "import worldstate.cli.main",
 )
