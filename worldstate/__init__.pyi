@@ -1,7 +1,7 @@
 # Verbs first; isort would mix them with the types.
+from .adapters.export.dataframe import to_dataframe as to_dataframe
 from .adapters.listener import listen as listen
 from .operations.corpus.corpus_run import hear as hear
-from .state.views import to_dataframe as to_dataframe
 
 # isort: split
 from .abduction.co_evidence import Absent as Absent

@@ -19,11 +19,12 @@ from hypothesis import strategies as st
 from snapshot_laws import broken_laws
 from watched_street import START_NS, false_alarms, heard
 
-from worldstate import Sighting, WorldFilter
+from worldstate import Sighting, WorldFilter, to_dataframe
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.road_users import Familiar, Foreign
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
+from worldstate.adapters.export import dataframe
 from worldstate.ground import LEAST_HEARD, NotUsable
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
 from worldstate.measurement import Bearing, Heard
@@ -48,12 +49,9 @@ from worldstate.state import (
     Visibility,
     WorldState,
     snapshot_schema,
-    to_dataframe,
 )
-from worldstate.state import views as state_views
 from worldstate.state.cue import WhyNot
 from worldstate.state.sensor import MASKED
-from worldstate.state.views import headline
 from worldstate.state.world_state import judged
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "docs" / "_ext"))
@@ -239,19 +237,16 @@ def test_a_printed_state_reads_as_a_sentence():
     state = WorldState(5_500_000_000, 45, entities=(car,), cues=(advised, other))
     line = "5.5 s  right: ADVISORY, risk 0.87, hidden car at 48 degrees right, in view in 1.8 s (0.9 to 3.2)"
     assert str(state) == line
-    assert headline(state) == "Right: a vehicle is hidden, 73 % to appear within 3 s."
     unheard = replace(advised, usable=False, why_not=("unheard",))
     assert "ADVISORY (not usable: unheard), risk" in str(replace(state, cues=(unheard, other)))
     quiet = replace(state, cues=(replace(advised, advisory=None, risk=0.12), other))
     assert str(quiet) == "5.5 s  no advisory, risk 0.04 left, 0.12 right"
-    assert headline(quiet) == "No advisory. The highest risk is 0.12, on the right."
     seen = replace(quiet, entities=(replace(car, status="visible", azimuth_rad=math.radians(12)),))
     assert str(seen).splitlines()[1] == "       in view: car at 12 degrees left"
     bearing = Bearing(math.radians(-48), 0.1, 2.0)
     reason = NotUsable("no model was made for this array of 4 microphones")
     without = WorldState(5_500_000_000, 45, bearing=bearing, no_model=reason)
     assert str(without) == f"5.5 s  sound from 48 degrees right; no risk: {reason.reason}"
-    assert headline(without) == "A sound comes from 48 degrees right; its risk cannot be stated."
 
 
 @given(states)
@@ -287,7 +282,7 @@ class Table:
 @settings(max_examples=20)
 def test_a_table_has_a_row_for_every_side_of_every_state(these):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(state_views, "optional", {"pandas": Table}.__getitem__)
+        patch.setattr(dataframe, "optional", {"pandas": Table}.__getitem__)
         rows = to_dataframe(iter(these))
     expected = [(state.time_s, side) for state in these for side in (sides_of(state) or [None])]
     assert [(row["time_s"], row["side"]) for row in rows] == expected

@@ -42,7 +42,9 @@ def test_all_names_together_can_be_learned():
 
 @pytest.mark.parametrize("name", worldstate._FORMER)
 def test_a_name_that_has_moved_warns_and_names_its_package(name):
-    with pytest.warns(DeprecationWarning, match=rf"^worldstate\.{name} is worldstate\.\w+\.{name}$") as caught:
+    with pytest.warns(
+        DeprecationWarning, match=rf"^worldstate\.{name} is worldstate\.\w+\.{name}$"
+    ) as caught:
         value = getattr(worldstate, name)
     assert caught[0].filename == __file__
     package = str(caught[0].message).split(" is ")[1].rpartition(".")[0]

@@ -21,6 +21,5 @@ from .sensor import Delivery as Delivery
 from .sensor import Hearing as Hearing
 from .sensor import SearchedView as SearchedView
 from .sensor import SensorHealth as SensorHealth
-from .views import to_dataframe as to_dataframe
 from .world_state import WorldState as WorldState
 from .world_state import snapshot_schema as snapshot_schema

@@ -18,7 +18,7 @@ from .context import Context
 from .cue import Budget, CueList, Cues, RiskCue, WhyNot
 from .entity import EGO, Entity, Event, Relation
 from .sensor import MASKED, Delivery, Ego, Hearing, SearchedView, SensorHealth
-from .views import text
+from .text import state_lines, state_text
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -122,10 +122,11 @@ class WorldState:
         object.__setattr__(self, "cues", Cues(cue.at(self.stamp_ns) for cue in cues))
 
     def __repr__(self) -> str:
-        return text(self)
+        lines = state_lines(self.seq > 0, self.cues, self.entities, self.bearing, self.no_model)
+        return state_text(self.time_s, lines)
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(text(self))}</pre>"
+        return f"<pre>{escape(repr(self))}</pre>"
 
     @property
     def time_s(self) -> float:
