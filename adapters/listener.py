@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -289,7 +289,7 @@ class Listener:
             _LOG.warning("%s: what %s", name, problem)
             self._warned.add(name)
 
-    def look(self, stamp_ns: int, frame: DetectionFrame, camera: str = SENSOR) -> None:
+    def look(self, stamp_ns: int, frame: DetectionFrame | Any, camera: str = SENSOR) -> None:
         """Take what a running detector found in an image; of several cameras the one is named.
 
         One that was taken more than two seconds before the sound, or after what is pushed next, is refused,
@@ -300,7 +300,7 @@ class Listener:
         ----------
         stamp_ns : int
             When the image was taken by the stamps of the camera, nanoseconds.
-        frame : DetectionFrame
+        frame : DetectionFrame, or Detections of supervision, or Results of ultralytics
             All of its boxes.
         camera : str
             Name of the camera, where the source has several.
@@ -316,7 +316,8 @@ class Listener:
             check_mounting(self._source.array)
             self._blind = False
         query = self._cameras[one_of("camera", camera, self._cameras)]
-        held_bytes = checked_frame("look", frame).boxes_px.nbytes + sum(map(len, frame.labels))
+        frame = checked_frame("look", frame)
+        held_bytes = frame.boxes_px.nbytes + sum(map(len, frame.labels))
         taken_ns = query.taken_ns(integer_ns("stamp_ns", stamp_ns))
         self._take(taken_ns, camera, partial(_seen, query, stamp_ns, frame), held_bytes)
 

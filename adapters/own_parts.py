@@ -120,10 +120,12 @@ class OwnDetector:
 
 
 def checked_frame(name: str, found: object) -> DetectionFrame:
-    """Return what a detector gave; refuse None and whatever else is no `DetectionFrame`."""
-    if not isinstance(found, DetectionFrame):
-        raise InvalidArgumentError(f"{name}: expected a DetectionFrame, got {found!r:.60}")
-    return found
+    """Return the boxes that a detector found; refuse a result of no known kind, such as None."""
+    frame = DetectionFrame.of(found)
+    if frame is None:
+        expected = "a DetectionFrame, or a result of supervision or ultralytics"
+        raise InvalidArgumentError(f"{name}: expected {expected}, got {found!r:.60}")
+    return frame
 
 
 def checked_timed(name: str, told: object) -> Timed:

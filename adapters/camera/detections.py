@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 
@@ -69,6 +69,11 @@ def _name(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def _array(values: Any) -> FloatArray:
+    """Return numbers as an array, also those of a tensor in the memory of an accelerator."""
+    return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=np.float64)
+
+
 # Of a class, category or image; some write numbers.
 Name = Annotated[str, Via(object, _name, _name)]
 
@@ -118,6 +123,47 @@ class DetectionFrame:
             got = f"{self.boxes_px[first].tolist()} with {self.scores[first]:g}"
             problem = "expected x1 <= x2, y1 <= y2 (corners, no width and height) and scores in [0, 1]"
             raise InvalidArgumentError(f"boxes[{first}]: {problem}, got {got}")
+
+    @classmethod
+    def of(cls, found: Any) -> "DetectionFrame | None":
+        """Return the boxes of one image from the result of a detector; None if it is of no known kind.
+
+        Known kinds are `DetectionFrame`, supervision's `Detections` and ultralytics' `Results`, which are
+        recognised by their attributes, and a list that holds one of them, as a model of ultralytics returns.
+        Boxes without scores get the score 1.
+
+        Raises
+        ------
+        InvalidArgumentError
+            If boxes have no class names, or are no boxes.
+
+        Examples
+        --------
+        >>> from types import SimpleNamespace
+        >>> boxes, scores = np.array([[10.0, 20.0, 60.0, 140.0]]), np.array([0.9])
+        >>> of_supervision = SimpleNamespace(xyxy=boxes, confidence=scores, data={"class_name": ["car"]})
+        >>> DetectionFrame.of(of_supervision).labels
+        ('car',)
+        """
+        if isinstance(found, list) and len(found) == 1:
+            found = found[0]
+        if isinstance(found, cls):
+            return found
+        if hasattr(found, "boxes") and hasattr(found, "names"):
+            if found.boxes is None:
+                raise InvalidArgumentError("boxes: expected the result of a detection model, got none")
+            corners, scores, numbers = map(_array, (found.boxes.xyxy, found.boxes.conf, found.boxes.cls))
+            labels = [str(found.names[int(number)]) for number in numbers]
+        elif hasattr(found, "xyxy") and hasattr(found, "confidence"):
+            corners, scores = _array(found.xyxy), found.confidence
+            scores = np.ones(len(corners)) if scores is None else _array(scores)
+            labels = [str(label) for label in getattr(found, "data", {}).get("class_name", ())]
+            if len(labels) != len(corners):
+                got = f"{len(labels)} for {len(corners)} boxes"
+                raise InvalidArgumentError(f'data["class_name"]: expected a name for each box, got {got}')
+        else:
+            return None
+        return cls(corners, scores, tuple(labels))
 
     def __len__(self) -> int:
         return len(self.labels)

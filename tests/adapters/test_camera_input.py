@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -339,3 +340,68 @@ def test_the_yaw_of_a_camera_goes_round(yaw_deg, wrapped_deg, tmp_path):
     camera, _ = read_camera_setup(tmp_path / "c.json")
     assert math.degrees(camera.yaw_rad) == pytest.approx(wrapped_deg)
     assert camera.stamp_offset_s == -1.7e9
+
+
+class Tensor:
+    """As torch's in the memory of an accelerator: numpy reads it only after `cpu`."""
+
+    def __init__(self, values):
+        self.values = np.asarray(values, np.float32)
+
+    def cpu(self):
+        return self.values
+
+
+def of_ultralytics(boxes, scores, classes, names):
+    found = SimpleNamespace(xyxy=Tensor(boxes), conf=Tensor(scores), cls=Tensor(classes))
+    return SimpleNamespace(boxes=found, names=names, obb=None)
+
+
+def of_supervision(boxes, scores, names):
+    data = {"class_name": np.array(names)} if names else {}
+    return SimpleNamespace(xyxy=np.array(boxes, np.float32).reshape(-1, 4), confidence=scores, data=data)
+
+
+NO_SCORES = None
+TWO, NAMES = [[*INSIDE], [300.0, 200.0, 340.0, 260.0]], {0: "person", 2: "car"}
+
+
+@pytest.mark.parametrize(
+    ("found", "labels", "scores"),
+    [
+        (of_ultralytics(TWO, [1.0, 0.75], [2, 0], NAMES), ("car", "person"), [1.0, 0.75]),
+        ([of_ultralytics(TWO, [1.0, 0.75], [2, 0], NAMES)], ("car", "person"), [1.0, 0.75]),
+        (of_ultralytics(np.empty((0, 4)), [], [], NAMES), (), []),
+        (of_supervision(TWO, np.array([1.0, 0.75]), ["car", "bus"]), ("car", "bus"), [1.0, 0.75]),
+        (of_supervision(TWO, NO_SCORES, ["car", "bus"]), ("car", "bus"), [1.0, 1.0]),
+        (of_supervision([], np.empty(0), []), (), []),
+    ],
+)
+def test_results_of_other_libraries_are_looks(found, labels, scores):
+    frame = DetectionFrame.of(found)
+    assert (frame.labels, frame.scores.tolist()) == (labels, scores)
+    assert frame.boxes_px.tolist() == (TWO if labels else [])
+    ours, theirs = (Listener(ovad_array(), 48_000, camera=SMALL) for _ in range(2))
+    silence = np.zeros((48_000, 56), np.float32)
+    for listener, look in ((ours, frame), (theirs, found)):
+        listener.look(950_000_000, look)
+        listener.push(silence)
+    assert theirs.world.state == ours.world.state
+    assert bool(theirs.world.state.entities) == bool(labels)
+
+
+@pytest.mark.parametrize(
+    ("found", "problem"),
+    [
+        (
+            of_supervision(TWO, NO_SCORES, []),
+            r"class_name.*: expected a name for each box, got 0 for 2",
+        ),
+        (SimpleNamespace(boxes=None, names=NAMES), "expected the result of a detection model"),
+        (of_ultralytics(TWO, [0.5], [2, 0], NAMES), "scores: expected shape"),
+        ([], "look: expected a DetectionFrame, or a result of supervision or ultralytics, got"),
+    ],
+)
+def test_a_result_that_holds_no_boxes_is_refused(found, problem):
+    with pytest.raises(InvalidArgumentError, match=problem):
+        Listener(ovad_array(), 48_000, camera=SMALL).look(0, found)

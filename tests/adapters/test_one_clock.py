@@ -477,7 +477,7 @@ def test_a_stamp_that_is_no_whole_number_is_refused_by_name(stamp_ns: Any) -> No
     listener = three()
     with pytest.raises(InvalidArgumentError, match="stamp_ns: expected integer nanoseconds"):
         listener.look(stamp_ns, NONE)
-    with pytest.raises(InvalidArgumentError, match="look: expected a DetectionFrame, got None"):
+    with pytest.raises(InvalidArgumentError, match="look: expected a DetectionFrame, or a result"):
         listener.look(0, None)  # type: ignore[arg-type]
     with pytest.raises(InvalidArgumentError, match="add: expected Measurement"):
         listener.add(stamp_ns)
