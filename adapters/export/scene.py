@@ -296,11 +296,11 @@ def label_of(entity: Entity) -> str:
     Examples
     --------
     >>> label_of(Entity("id", "hidden", 0.9, 0.8, 0.8, azimuth_std_rad=0.3, created_ns=0, updated_ns=0))
-    'hidden .90'
+    'hidden 0.90'
     """
     likeliest = max(entity.classification or (), key=lambda one: one.probability, default=None)
     kind = likeliest.label if likeliest is not None and likeliest.label != "unknown" else None
-    told = entity.status, kind, _short(entity.existence_probability)
+    told = entity.status, kind, f"{entity.existence_probability:.2f}"
     return " ".join(one for one in told if one is not None)
 
 
@@ -326,9 +326,9 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
     raised = cue.advisory is not None
     color = Rgba(*(_DECISION if raised else _HIDDEN), 0.05 + 0.5 * (cue.risk or 0.0))
     shape = () if cue.risk is None else (_sector(sector_rad, CUE_M, color, "cue"),)
-    said = [] if cue.risk is None else [f"risk {_short(cue.risk)}"]
+    said = [] if cue.risk is None else [f"risk {cue.risk:.2f}"]
     if cue.within is not None and "3" in cue.within:
-        said.append(f"in 3 s {_short(cue.within['3'])}")
+        said.append(f"in 3 s {cue.within['3']:.2f}")
     said += ["ADVISORY"] * raised + [f"not usable: {', '.join(cue.why_not)}"] * (not cue.usable)
     side = cue.direction or "side unknown"
     text = _text(cue.azimuth_rad, CUE_M + 2.0, f"{side}: {', '.join(said)}", _DECISION if raised else _GREY)
@@ -407,7 +407,3 @@ def _pairs(**values: object) -> tuple[ScenePair, ...]:
 
 def _words(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _short(probability: float) -> str:
-    return f"{probability:.2f}".removeprefix("0")

@@ -21,10 +21,11 @@ from worldstate.abduction.co_evidence import Absent
 from worldstate.cli.main import main
 from worldstate.ground import extras
 from worldstate.measurement import Look, Sighting
-from worldstate.measurement.measurement import CameraLook
-from worldstate.operations.recordings.evidence_report import WHY_NOT, sentence
+from worldstate.measurement.measurement import Bearing, CameraLook
+from worldstate.operations.recordings.evidence_report import WHY_NOT
 from worldstate.operations.viewing import live_page
 from worldstate.operations.viewing.live_page import STATES, LivePage
+from worldstate.operations.viewing.log_page import headline, is_reflected
 
 BOXES = Sighting(0.2, 0.02, "car", 0.9, 0.1), Sighting(-0.3, 0.02, "</script><b>", 0.5, 0.05, moving=False)
 
@@ -182,21 +183,33 @@ def test_a_sentence_names_every_advisory_and_every_reason_against_it(state, advi
         replace(one, usable=not reasons, why_not=tuple(reasons), advisory=one.advisory if advised else None)
         for one in state.cues
     )
-    said = sentence(replace(state, cues=cues))
+    said = headline(replace(state, cues=cues))
     for cue in cues:
-        assert (f"hidden on the {cue.direction}, risk {cue.risk:.2f}" in said) == (cue.advisory is not None)
-    assert said.startswith("Advisory: " if any(one.advisory for one in cues) else "No advisory: ")
+        told = f"{cue.direction}: a vehicle is hidden, {100 * cue.within['3']:.0f} % to appear within 3 s"
+        assert (told in said.lower()) == (cue.advisory is not None)
+    assert said.startswith("No advisory: ") == (not any(one.advisory for one in cues))
     assert all(WHY_NOT[one] in said for one in reasons)
-    assert ("Not to be acted on" in said) == bool(reasons)
+    assert ("Do not act on it" in said) == bool(reasons)
 
 
 def test_without_a_model_the_sentence_states_no_risk(states):
     cue = replace(states[-1].cues[0], direction=None, risk=None, advisory=None, within=None, evidence=None)
     bearing = SimpleNamespace(azimuth_rad=-0.5)
-    said = sentence(replace(states[-1], cues=(cue,), bearing=bearing))
-    assert "Sound from 29 degrees right" in said
-    assert "advisory" not in said.lower()
-    assert "acted" not in said  # there is nothing to act on
+    said = headline(replace(states[-1], cues=(cue,), bearing=bearing))
+    assert said == "A sound comes from 29 degrees right; no risk can be stated."
+
+
+def test_sound_is_a_reflection_while_a_vehicle_is_hidden_and_none_is_in_view_there(states):
+    hidden, in_view = states[0], states[-1]
+    assert hidden.left.advisory and in_view.left.advisory
+    sound = {"bearing": Bearing(-1.0, 0.1, 2.0)}
+    assert is_reflected(replace(hidden, **sound))
+    assert is_reflected(replace(in_view, **sound))
+    there = replace(in_view, bearing=Bearing(in_view.entities[0].azimuth_rad + 0.1, 0.1, 2.0))
+    assert not is_reflected(there)
+    quiet = replace(hidden, cues=tuple(replace(one, advisory=None, risk=0.1) for one in hidden.cues))
+    assert not is_reflected(replace(quiet, **sound))
+    assert not is_reflected(replace(hidden, bearing=None))
 
 
 @pytest.mark.long
@@ -220,7 +233,7 @@ def test_a_browser_shows_the_run_without_an_error(states, tmp_path):
                 assert seen.value(width)
                 ground = seen.value("getComputedStyle(document.body).backgroundColor")
                 assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 23, 26)"}[scheme]
-        assert seen.value("at('sentence').textContent") == sentence(states[-1])
+        assert seen.value("at('sentence').textContent") == headline(states[-1])
         seen.until(f"rows.length === {len(states) + 4}")
         assert "40 ms behind the sound" in seen.value(shown)
         boxes = seen.value(
@@ -250,5 +263,5 @@ def test_a_browser_states_that_the_run_has_ended(tmp_path):
     with browser(tmp_path / "profile") as seen:
         with LivePage(0) as page:
             seen.open(page.url)
-        seen.until("at('remarks').textContent.includes('no more states')")
+        seen.until("at('remarks').textContent.includes('The run has ended')")
         assert not seen.faults()

@@ -331,6 +331,8 @@ def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states
     with browser(tmp_path / "profile") as page:
         page.open((tmp_path / "log.html").as_uri())
         page.press("End")
+        folded = page.value("[...document.querySelectorAll('h2')].map(one => one.textContent).join()")
+        page.value("at('odds').open = true, drawCharts()")
         written_in = "document.querySelectorAll('h2, .legend, svg text')"
         texts = page.value(f"[...{written_in}].map(one => one.textContent)")
         paths = page.value(
@@ -344,9 +346,10 @@ def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states
             "getComputedStyle([...document.querySelectorAll('.legend')]"
             ".find(one => one.textContent === 'advisory'), '::before').borderTopColor])"
         )
+    assert "Log-odds" not in folded
     nats = sum(states[-1].cues[0].evidence.terms_nats.values())
-    assert texts[texts.index("together now") + 1] == f"{nats:+.2f}"
-    decides = texts[texts.index("mean of .3 s: decides", texts.index("together now")) + 1]
+    assert texts[texts.index("sum") + 1] == f"{nats:+.2f}"
+    decides = texts[texts.index("compared: mean over 0.3 s", texts.index("sum")) + 1]
     assert decides == f"{states[-1].cues[0].evidence.compared_nats:+.2f}"
     assert "below \u22128" in texts
     assert not [one for one in texts if re.search(r"window|sequence|looks", one)]
@@ -375,7 +378,7 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
     colours = (
         "[...document.querySelectorAll('#street polygon, #charts path')].map(one => one.getAttribute('fill'))"
     )
-    dashes = "document.querySelectorAll('#charts path[stroke-dasharray=\"6 4\"]').length"
+    dashes = "document.querySelectorAll('#evidence path[stroke-dasharray=\"6 4\"]').length"
     screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
     with browser(tmp_path / "profile") as page:
         page.call("Emulation.setDeviceMetricsOverride", **screen)
@@ -384,6 +387,10 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
             write_log_page(path, page_data(shown, **parts))
             page.events.clear()
             page.open(path.as_uri())
+            page.value("at('odds').open = true")
+            page.until(
+                f"at('odds').hidden || at('evidence').childElementCount >= {2 if name == 'whole' else 0}"
+            )
             assert page.value(dashes) == (2 if name in ("whole", "since") else 0)
             drawn = {"var(--hidden)", "var(--view)", "var(--heard)"} & set(page.value(colours))
             assert (drawn == {"var(--heard)"}) == (name == "without a model")

@@ -1,4 +1,4 @@
-// A run that goes on: a websocket brings its hops, and the page draws the last minute of them four times a second.
+// A live run: a websocket delivers the hops, and the page draws the last minute four times a second.
 const MOST = 600, DRAWN_EVERY_MS = 250;
 const health = put(at("title").parentNode, "p", { id: "health", role: "status" });
 const cameras = put(at("street").parentNode, "div", { id: "cameras" }), views = {};
@@ -25,14 +25,14 @@ function drawHealth({ live, sensors, heard, cues }) {
   health.replaceChildren();
   const chip = (text, bad) => put(health, "span", { class: bad ? "chip bad" : "chip" }, text);
   for (const [name, condition, reason] of sensors) {
-    const share = cues.length && name in heard ? `, notices ${short(heard[name])} of hidden vehicles` : "";
+    const share = cues.length && name in heard ? `, detects ${Math.round(100 * heard[name])} % of hidden vehicles` : "";
     const bad = condition !== "working" || heard[name] < 0.5;
     chip(`${name}: ${condition}${reason ? ` (${reason})` : ""}${share}`, bad);
   }
   chip(`${Math.round(1000 * live.latency_s)} ms behind the sound`, live.latency_s > 0.5);
   if (live.overruns) chip(`${live.overruns} overruns, ${live.lost_s.toFixed(2)} s of sound lost`, true);
 }
-// What each camera found, as it looks: left is left. A box is as wide as it is seen; a parked one is hollow.
+// The boxes of each camera, left on the left, with their true angular width; a parked one is hollow.
 function drawCameras(row) {
   Object.assign(views, row.cameras);
   cameras.replaceChildren();
@@ -70,8 +70,8 @@ function receive(more) {
 }
 document.addEventListener("visibilitychange", drawReceived);
 follow(true);
-at("sentence").textContent = "The first snapshot follows a second of sound.";
+at("sentence").textContent = "The first snapshot needs one second of sound.";
 const feed = new WebSocket(`ws://${location.host}@states@`);
 feed.onmessage = ({ data }) => receive(JSON.parse(data));
-// Nothing is asked again: a browser counts each attempt without a run as an error of the page.
-feed.onclose = () => put(at("remarks"), "p", { class: "remark" }, "The run gives no more states. Reload this page for another run.");
+// The page does not reconnect: a browser reports each attempt without a server as an error.
+feed.onclose = () => put(at("remarks"), "p", { class: "remark" }, "The run has ended. Reload this page to show another run.");

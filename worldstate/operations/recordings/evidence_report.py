@@ -196,37 +196,6 @@ def common_lines(state: WorldState) -> Iterator[str]:
     yield from (f"event: {event.entity_id[:8]} {event.kind.replace('_', ' ')}" for event in state.events)
 
 
-def sentence(state: WorldState) -> str:
-    """Return a one-sentence summary: the advisories or the highest risk, and why the cues are not usable.
-
-    Examples
-    --------
-    >>> sentence(WorldState(0, 0))
-    'No advisory: no vehicle is heard.'
-    """
-    advised = [cue for cue in state.cues if cue.advisory is not None]
-    stated = [cue for cue in state.cues if cue.risk is not None]
-    if advised:
-        said = f"Advisory: {'; '.join(map(_announced, advised))}."
-    elif stated:
-        highest = max(stated, key=lambda cue: cue.risk or 0.0)
-        said = f"No advisory: the highest risk is {highest.risk:.2f}, on the {highest.direction}."
-    elif state.bearing is not None:
-        to_left_deg = math.degrees(state.bearing.azimuth_rad)
-        side = "left" if to_left_deg > 0.0 else "right"
-        said = f"Sound from {abs(to_left_deg):.0f} degrees {side}; no risk is stated."
-    else:
-        said = "No advisory: no vehicle is heard."
-    reasons = dict.fromkeys(WHY_NOT[one] for cue in stated for one in cue.why_not)
-    return f"{said} Not to be acted on: {'; '.join(reasons)}." if reasons else said
-
-
-def _announced(cue: RiskCue) -> str:
-    times = cue.time_to_visible_s and "{1:.1f} s ({0:.1f} to {2:.1f})".format(*cue.time_to_visible_s)
-    risk = f"risk {cue.risk or 0.0:.2f}"
-    return f"a vehicle is hidden on the {cue.direction}, {risk}{f', in view in {times}' if times else ''}"
-
-
 def _promised(budget: Budget) -> str:
     """Return the requested budget of the alarm, and the rates that its curve predicts for it."""
     asked, promise = f"{budget.onsets_per_hour:g} onsets an hour", budget.promise

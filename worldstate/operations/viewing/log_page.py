@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from worldstate.abduction.road_users import Foreign
 from worldstate.adapters.datasets.ovad import TrueTrack
+from worldstate.adapters.export.other_stacks import CROSSING_M
 from worldstate.adapters.export.scene import CompressedImage, RawAudio, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.file_io import write_text
 from worldstate.ground import InputFileError, InvalidArgumentError, seconds
-from worldstate.operations.recordings.evidence_report import common_lines, sentence
+from worldstate.operations.recordings.evidence_report import WHY_NOT, common_lines
 from worldstate.state import Entity, RiskCue, WorldState
+from worldstate.state.text import plain, towards
 
 # A snapshot with two entities is 1 kB: five to ten minutes are shown whole, and they take 6 MB at most.
 MOST_STATES = 3000
@@ -31,6 +33,8 @@ MOST_IMAGES, MOST_CHARACTERS = 300, 12_000_000
 MOST_SOUND_S, HIGHEST_RATE_HZ, _MOST_RATE_HZ = 180.0, 16_000, 1_000_000
 # Images and sound stand in a log near the snapshots of their time.
 _WRITTEN_WITHIN_NS = 1_000_000_000
+# Half the sector in which a camera is searched for the source of a sound.
+_BESIDE_RAD = math.radians(10.0)
 # A street has fewer; of a fault that gives birth to many the likeliest are enough to see it.
 _MOST_ENTITIES = 16
 
@@ -244,6 +248,54 @@ def _remarks(count: int, every: int, calibrated: int) -> list[str]:
     return said
 
 
+def headline(state: WorldState) -> str:
+    """Return the first sentence of the page: the advisories or the highest risk, and whether it may be used.
+
+    Examples
+    --------
+    >>> headline(WorldState(0, 0))
+    'There is no measurement yet.'
+    """
+    sides = sorted((cue for cue in state.cues if cue.direction), key=lambda cue: -(cue.risk or 0.0))
+    advised = "; ".join(f"{plain(cue.direction)}: {_hidden(cue)}" for cue in sides if cue.advisory)
+    if advised:
+        said = f"{advised[0].upper()}{advised[1:]}."
+    elif sides and sides[0].risk is not None:
+        said = f"No advisory: the highest risk is {sides[0].risk:.2f}, on the {plain(sides[0].direction)}."
+    elif state.bearing is not None:
+        said = f"A sound comes from {towards(state.bearing.azimuth_rad)}; no risk can be stated."
+    else:
+        said = "No risk can be stated." if state.seq else "There is no measurement yet."
+    reasons = dict.fromkeys(WHY_NOT[one] for cue in sides for one in cue.why_not)
+    return f"{said} Do not act on it: {'; '.join(reasons)}." if reasons else said
+
+
+def _hidden(cue: RiskCue) -> str:
+    within = (cue.within or {}).get("3")
+    chance = (
+        f"risk {cue.risk or 0.0:.2f}" if within is None else f"{100.0 * within:.0f} % to appear within 3 s"
+    )
+    return f"a vehicle is hidden, {chance}"
+
+
+def is_reflected(state: WorldState) -> bool:
+    """Return whether the loudest sound is likely a reflection, or is bent round a corner.
+
+    It is while a vehicle is likely hidden, unless a vehicle in view is within 10 degrees of the sound: the
+    sound of a hidden vehicle has no straight path to the array.
+
+    Examples
+    --------
+    >>> is_reflected(WorldState(0, 0))
+    False
+    """
+    if state.bearing is None or not any(cue.advisory or (cue.risk or 0.0) >= 0.5 for cue in state.cues):
+        return False
+    in_view = (one for one in state.entities if one.moving and one.status in ("emerged", "visible"))
+    apart_rad = (math.remainder(one.azimuth_rad - state.bearing.azimuth_rad, math.tau) for one in in_view)
+    return not any(abs(one) <= _BESIDE_RAD for one in apart_rad)
+
+
 def page_row(state: WorldState) -> Row:
     """Return one snapshot as the page draws it, rounded to what can be seen there."""
     parts = (part for one in state.entities if one.moving for part in one.on_each_side())
@@ -252,14 +304,20 @@ def page_row(state: WorldState) -> Row:
     stated = [(one.direction, one.evidence) for one in state.cues if one.direction and one.evidence]
     return {
         "t": round(seconds(state.stamp_ns), 3),
-        "sentence": sentence(state),
+        "sentence": headline(state),
         "entities": list(map(_entity, likeliest)),
         "cues": [_cue(one) for one in state.cues if one.direction is not None],
         "thresholds": {side: round(one.threshold_nats, 2) for side, one in stated},
         "bearing": None if bearing is None else degrees(bearing.azimuth_rad),
+        "reflected": is_reflected(state),
         "prominence": None if bearing is None else round(bearing.prominence, 2),
         "corners": [
-            {"edge": degrees(one.edge_azimuth_rad), "assumed": one.assumed, **sector(hidden_sector(one))}
+            {
+                "edge": degrees(one.edge_azimuth_rad),
+                "assumed": one.assumed,
+                "crossing": CROSSING_M if one.crossing_m is None else one.crossing_m,
+                **sector(hidden_sector(one)),
+            }
             for one in state.context.occluders
         ],
         "searched": [
