@@ -1,4 +1,4 @@
-"""Context: rates, occluders, priors and the field of view, given before any measurement."""
+"""Context: rates, occluders, priors and the field of view, which are given before any measurement."""
 
 import math
 from collections.abc import Mapping
@@ -24,16 +24,16 @@ _OCCLUDER = {
     "hides": bool,
     "crossing_m": (0.0, 2.0 * _FARTHEST_M, None),
 }
-_PASSED_M = 0.5  # Nearer ahead than this, a corner stands abeam: a vehicle that comes past it is in view
+_PASSED_M = 0.5  # A corner less than this ahead is abeam: a vehicle that passes it is in view
 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Transition rates of the explanations, 1/s: what a street is like in which nothing was measured.
+    """Transition rates of the explanations without measurements, 1/s.
 
-    Their equilibrium is the prior of a context that gives none. The defaults are those of a side street with
-    a few vehicles a minute: a hidden vehicle is heard for some three seconds before it comes into view, and
-    stays in view for about as long.
+    Their equilibrium is the prior of a context without priors. The defaults describe a side street with a few
+    vehicles per minute: a hidden vehicle is audible for some 3 s before it comes into view, and is in view
+    for about as long.
 
     Parameters
     ----------
@@ -42,18 +42,18 @@ class Rates:
     emergence_hz : float
         hidden -> visible.
     departure_hz : float
-        hidden -> none: it turns away or falls silent.
+        hidden -> none: it turns away or becomes silent.
     reocclusion_hz : float
         visible -> hidden, all directions together.
     visible_arrival_hz : float
-        none -> visible, for traffic that was never hidden.
+        none -> visible: traffic that was never hidden.
     visible_departure_hz : float
         visible -> none.
 
     Raises
     ------
     InvalidArgumentError
-        If one is negative or not finite.
+        If a rate is negative or not finite.
 
     Examples
     --------
@@ -62,7 +62,7 @@ class Rates:
     """
 
     arrival_hz: float = 0.05  # Three vehicles a minute from each side
-    emergence_hz: float = 0.3  # Heard for some 3 s before it comes into view
+    emergence_hz: float = 0.3  # Audible for some 3 s before it comes into view
     departure_hz: float = 0.1  # One in four hidden vehicles never comes into view
     reocclusion_hz: float = arrival_hz  # One in seven vehicles in view goes behind a corner again
     visible_arrival_hz: float = arrival_hz  # Along the ego vehicle's own street, as from a side
@@ -72,7 +72,7 @@ class Rates:
         check_fields(self, **{one.name: (0.0, _FASTEST) for one in fields(self)})
 
     def priors(self, sides: int) -> "Priors":
-        r"""Return the equilibrium of a street with so many sides: the three probabilities p with p Q = 0.
+        r"""Return the equilibrium for a number of sides: the three probabilities p with p Q = 0.
 
         Examples
         --------
@@ -81,14 +81,14 @@ class Rates:
         (0.176, 0.235, 0.588)
         """
         arrival_hz = sides * self.arrival_hz
-        # Each state's weight is the sum over the ways that lead into it from both others.
+        # The weight of a state is the sum over the paths into it from both other states.
         leaves_hidden = self.emergence_hz + self.departure_hz
         leaves_visible = self.reocclusion_hz + self.visible_departure_hz
         hidden = arrival_hz * leaves_visible + self.visible_arrival_hz * self.reocclusion_hz
         visible = arrival_hz * self.emergence_hz + self.visible_arrival_hz * leaves_hidden
         none = leaves_hidden * leaves_visible - self.emergence_hz * self.reocclusion_hz
         total = hidden + visible + none
-        if total <= 0.0:  # Nothing ever changes, and nothing is known
+        if total <= 0.0:  # All rates are zero: no state is ever left
             return Priors(0.0, 0.0, 1.0)
         return Priors(hidden / total, visible / total, none / total)
 
@@ -105,7 +105,7 @@ class Priors:
     Raises
     ------
     InvalidArgumentError
-        If they do not.
+        If they do not sum to one.
 
     Examples
     --------
@@ -132,26 +132,27 @@ class Occluder:
     id : str
         Name, unique in the context.
     direction : str
-        Label of the approach side that it hides, as the signature model says it.
+        Label of the approach side that it hides, as in the signature model.
     edge_azimuth_rad : float
-        Azimuth of its edge, where hidden vehicles come into view; left positive.
+        Azimuth of its edge, at which hidden vehicles come into view; left positive.
     hidden_azimuth_rad, hidden_std_rad : float
-        Where behind it vehicles are before they are seen, and how widely they spread.
+        Mean azimuth of hidden vehicles behind it, and their standard deviation.
     edge_std_rad : float
         Standard deviation of the edge.
     pace_hz : float
-        Speed of vehicles behind it over the distance of their lane, 1/s: how fast the tangent of their
-        azimuth falls.
+        Speed of vehicles behind it divided by the distance of their lane, 1/s: the rate at which the tangent
+        of their azimuth decreases.
     assumed : bool
-        Whether this is the corner of a usual junction, since it is not known what stands here.
+        Whether it is assumed, as the corner of a typical junction, because the place is unknown.
     hides : bool
-        Whether it hides vehicles: not on an open road, and no longer once the ego vehicle is past it. What is
-        heard from this side is then in view, or outside of the camera's view, never hidden.
+        Whether it hides vehicles. It is false for an open road, and after the ego vehicle has passed it: then
+        sound from this side comes from a vehicle in view or outside the camera's view, never from a hidden
+        one.
     corner_m : (float, float) or None
-        Its corner in the map frame, metres; with it the edge moves as the ego vehicle does. Past another one
-        the line of sight is assumed to keep its place on the ground.
+        Its corner in the map frame, metres: the edge then moves with the ego vehicle. Without it the edge
+        keeps its azimuth.
     crossing_m : float or None
-        Where the lane behind it crosses the x axis of the map, metres.
+        Place at which the lane behind it crosses the x axis of the map, metres.
 
     Examples
     --------
@@ -164,7 +165,7 @@ class Occluder:
     edge_azimuth_rad: float
     hidden_azimuth_rad: float
     hidden_std_rad: float
-    # Corners of OVAD's junctions stand at 32 degrees, give or take this, from where the ego stops.
+    # The corners of OVAD's junctions are at 32 +- 5 degrees from the place at which the ego stops.
     edge_std_rad: float = math.radians(5.0)
     pace_hz: float = 0.5  # Real vehicles of OVAD pass T0 at 4 to 5 m/s, some 9 m ahead
     assumed: bool = False
@@ -176,7 +177,7 @@ class Occluder:
         check_fields(self, **_OCCLUDER)
         if self.corner_m is not None:
             object.__setattr__(self, "corner_m", pair("corner_m", self.corner_m, _FARTHEST_M))
-            # Else an ego vehicle that drives up to the corner would cross the lane before it has passed it.
+            # Otherwise an ego vehicle would cross the lane before it has passed the corner.
             if self.crossing_m is not None and self.crossing_m <= max(self.corner_m[0], 0.0):
                 expected = f"the lane beyond the corner, {self.corner_m[0]} m ahead"
                 raise InvalidArgumentError(f"crossing_m: expected {expected}, got {self.crossing_m}")
@@ -202,8 +203,8 @@ def blind_corner(direction: str, side: int) -> Occluder:
     >>> round(blind_corner("right", -1).edge_azimuth_rad, 2)
     -0.56
     """
-    # The nominal corner of OVAD's junctions; three quarters of the peaks in its real hidden windows stand at
-    # 42 to 63 deg.
+    # The nominal corner of OVAD's junctions; three quarters of the peaks in its real hidden windows are at 42
+    # to 63 deg.
     edge, hidden, std = math.radians(32.0), math.radians(55.0), math.radians(20.0)
     return Occluder(f"corner_{direction}", direction, side * edge, side * hidden, std, assumed=True)
 
@@ -216,9 +217,9 @@ def corner_at(
     speed_mps: float = 4.5,
     corner_std_m: float = 0.5,
 ) -> Occluder:
-    r"""Return the occluder whose corner stands at a place.
+    r"""Return the occluder with its corner at a given place.
 
-    A vehicle in the crossing lane, ``crossing_m`` ahead, is seen past the corner once
+    A vehicle in the crossing lane, ``crossing_m`` ahead, is in line of sight past the corner as soon as
 
     .. math:: \tan\theta \le \tan a = y_c / x_c
 
@@ -227,18 +228,18 @@ def corner_at(
     direction : str
         Label of the approach side.
     corner_m : tuple of float
-        The corner that hides it, x ahead and y to the left of the ego, metres (REP-103).
+        The corner, x ahead and y to the left of the ego, metres (REP-103).
     crossing_m : float
         Distance ahead of the lane in which vehicles come from this side, metres; beyond the corner.
     speed_mps : float
-        How fast they usually are where they come into view.
+        Usual speed of the vehicles as they come into view.
     corner_std_m : float
         Standard deviation of either coordinate of the corner.
 
     Returns
     -------
     Occluder
-        Edge and pace as seen from the ego; hidden vehicles two seconds behind the edge, give or take one.
+        Edge and pace as seen from the ego; hidden vehicles are 2 +- 1 s behind the edge.
 
     Raises
     ------
@@ -266,7 +267,7 @@ def corner_at(
         math.atan2(y_m, x_m),
         hidden_rad,
         hidden_std,
-        # Across the line of sight, the same for every direction of the error.
+        # Across the line of sight, where an isotropic error has the same deviation.
         edge_std_rad=min(corner_std_m / math.hypot(x_m, y_m), math.pi),
         pace_hz=pace_hz,
         corner_m=(x_m, y_m),
@@ -293,8 +294,8 @@ def seen_from(
     .. math:: a' = \operatorname{atan2}(y_c - y, x_c - x) - \psi, \qquad
               \sigma_{a'}^2 = \sigma_a^2 + \sigma_{xy}^2 / r^2 + \sigma_\psi^2
 
-    One whose corner is not given in metres stands wherever the ego vehicle is. One that it has passed hides
-    nothing any more.
+    An occluder without `corner_m` is returned unchanged. An occluder that the ego vehicle has passed hides
+    nothing.
 
     Examples
     --------
@@ -325,10 +326,10 @@ def seen_from(
 
 
 def hidden_behind(ahead_m: float, beside_m: float, pace_hz: float) -> tuple[float, float]:
-    """Return azimuth and deviation of a vehicle that comes in two (+- 1) seconds, behind a corner."""
+    """Return azimuth and deviation of a vehicle behind a corner that comes into view in 2 +- 1 s."""
     slope = abs(beside_m) / ahead_m
     near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
-    # Of a corner far away or at hand the second makes no difference.
+    # For a very distant or very near corner the three azimuths are equal.
     return math.copysign(middle, beside_m), max(0.5 * (far - near), _LEAST_STD_RAD)
 
 
@@ -339,29 +340,30 @@ class Context:
     Parameters
     ----------
     rates : Rates
-        How explanations change by themselves.
+        Transition rates of the explanations.
     occluders : tuple of Occluder
         One per approach side, in the order of the signature model's directions.
     priors : Priors or None
-        Explanation priors: in a context that is given what is usual here (None for the equilibrium of the
-        rates), predicted to the time stamp in a snapshot. A sequence model is moved to the given ones all
-        along, by -0.5 to +2 nats; without them it keeps the share of hazards that it was trained at.
+        Priors of the explanations. In a context that a user gives: the usual values at this place (None for
+        the equilibrium of the rates); in a snapshot: predicted to its time. The log-odds of a sequence model
+        are shifted to given priors, by -0.5 to +2 nats; without priors they keep the share of hazards in
+        training.
     hidden_by_side : mapping of str to float, or None
-        P(a vehicle comes into view from a side within eight seconds) by its direction, as an outer model
-        gives it, in place of what `priors` has of that side. It may differ from step to step: the belief
-        moves by the ratio of the odds, with and without a sequence model.
+        P(a vehicle comes into view from a side within 8 s) by direction, from an external model; it replaces
+        the prior of that side. If it changes between steps, the odds of the belief are multiplied by the
+        ratio of its odds, with and without a sequence model.
     ego_speed_mps, degradation : float or None
-        Ego speed, by which it drives straight on unless odometry says otherwise, and degradation level d of
-        the co-evidence channel in [0, 1].
+        Ego speed, which means straight motion without odometry, and degradation level d of the co-evidence
+        channel in [0, 1].
     site : str or None
         Name of the place.
     view_half_angle_rad : float
-        Half the horizontal field of view of the co-evidence channel, centred on the x axis.
+        Half of the horizontal field of view of the co-evidence channel, which is centred on the x axis.
 
     Raises
     ------
     InvalidArgumentError
-        Without an occluder, if two share an id or a direction, or if a number is out of range.
+        If there is no occluder, if two have the same id or direction, or if a number is out of range.
 
     Examples
     --------
@@ -372,7 +374,7 @@ class Context:
     LAYOUT: ClassVar = Layout(order="site ego_speed_mps degradation priors")
 
     rates: Rates = Rates()
-    # Without a map the place is taken for a blind junction, the case that the library is for.
+    # Without a map a blind junction is assumed, for which the library is made.
     occluders: tuple[Occluder, ...] = (blind_corner("left", 1), blind_corner("right", -1))
     priors: Priors | None = None
     ego_speed_mps: float | None = None

@@ -1,4 +1,4 @@
-"""Predictive cues: the calibrated, direction-resolved risk of a hidden road user."""
+"""Cues: the calibrated risk of a hidden road user, per direction."""
 
 import math
 from collections.abc import Mapping
@@ -22,11 +22,11 @@ class Advisory:
     Parameters
     ----------
     since_ns : int
-        Since when it has been out without a break, ns.
+        Time of its onset, ns; it has lasted since then without a break.
     valid_until_ns : int
-        When it ends without news, ns: a reader must not use it after that.
+        Time at which it ends without a new measurement, ns: a reader must not use it after that.
     sensors : tuple of SensorHealth
-        Those that it rests on: all that spoke while it can have been raised.
+        All sensors that can have contributed: those with a measurement in the second before.
 
     Examples
     --------
@@ -42,14 +42,14 @@ class Advisory:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """An advisory that stands although what decides it has fallen below its threshold.
+    """The reason for which an advisory continues although its log-odds are below the threshold.
 
     Parameters
     ----------
     entity_id : str or None
-        The vehicle for which it is held.
+        The vehicle for which it continues.
     until_ns : int
-        When it ends without news, ns; the hand-over of that vehicle ends it before.
+        Time at which it ends at the latest, ns; the hand-over of that vehicle ends it earlier.
 
     Examples
     --------
@@ -63,23 +63,24 @@ class Held:
 
 @dataclass(frozen=True, slots=True)
 class EvidenceTerms:
-    r"""What every piece of evidence adds to the log-odds that an alarm goes by.
+    r"""The contributions of all evidence to the log-odds that raise an alarm.
 
     .. math:: \log \frac{p}{1 - p} = \sum_j t_j
 
     Parameters
     ----------
     hypothesis : {"coming", "hidden", "announced"}
-        A vehicle comes into view from this side within three seconds, by a sequence model; one is hidden on
-        any side, without such a model; or messages alone announce one.
+        The event of the log-odds: a vehicle comes into view from this side within 3 s (with a sequence
+        model); a vehicle is hidden on any side (without one); or a vehicle that only messages announce.
     terms_nats : mapping of str to float
-        By what was said: the prior, the sequence or the window, each sensor's look, what has just come into
-        view, messages; each given those before it, so that they add up.
+        Terms by their origin: the prior, the sequence or the window, the looks, a vehicle that has just come
+        into view, messages. Each term is conditional on those before it, so that they add up.
     compared_nats : float
-        What decides: the mean of the log-odds over .3 s, of the less likely side no more than that two come.
+        The value that is compared with the threshold: the mean of the log-odds over 0.3 s. On the less likely
+        side it is at most the log-odds that two vehicles come.
     threshold_nats : float
-        An advisory stands exactly where `compared_nats` is not below it, or where the cue says that it is
-        held. It is 1.2 higher for five seconds after a vehicle has come into view.
+        The threshold. An advisory is active exactly if `compared_nats` is not below it, or if `held` of the
+        cue is given. It is 1.2 higher for 5 s after a vehicle has come into view.
 
     Examples
     --------
@@ -95,18 +96,18 @@ class EvidenceTerms:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What was counted of an alarm while a camera watched, at the model's own threshold.
+    """Numbers of alarms and arrivals while a camera searched, at the threshold of the model.
 
     Parameters
     ----------
     quiet_ns : int
-        Time in which no vehicle came into view within eight seconds before or after, ns.
+        Total time without a vehicle that came into view within 8 s before or after, ns.
     false_onsets : int
         Alarms that began in that time.
     arrivals : int
         Vehicles that came into view.
     warned : int
-        Those of them for whose side the alarm stood in the eight seconds before.
+        Arrivals with an alarm of their side in the 8 s before.
 
     Examples
     --------
@@ -121,7 +122,7 @@ class Tally:
 
 
 Verdict: TypeAlias = Literal["kept", "in doubt", "broken", "unwatched"]
-# Why a cue may not be acted on, in the order in which a cue gives its reasons.
+# Reasons for which a cue must not be used, in the order in which a cue lists them.
 WhyNot: TypeAlias = Literal[
     "uncalibrated", "unheard", "unknown sound", "too little sound", "budget broken", "expired", "masked"
 ]
@@ -129,27 +130,27 @@ WhyNot: TypeAlias = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    r"""Whether a sequence's alarm keeps to its budget, and its chances are true, by what a camera sees later.
+    r"""A test of the budget of alarms and of the stated probabilities, by later detections of a camera.
 
     Parameters
     ----------
     verdict : {"kept", "in doubt", "broken", "unwatched"}
-        In doubt from a tenth of what breaks it on; unwatched where no camera looks now.
+        In doubt from a tenth of the evidence that breaks the budget; unwatched if no camera searches now.
     why : str or None
-        What is broken, or that nothing watches; None otherwise.
+        Which of both tests failed, or why nothing is tested; None otherwise.
     evidence_nats : mapping of str to float
-        Log e-values against "no more onsets an hour than the budget" (``"onsets"``), and against "what comes
-        within two seconds is as frequent as stated" (``"within"``). Above zero they speak against it.
+        Log e-values against "no more onsets per hour than the budget" (``"onsets"``), and against "arrivals
+        within 2 s are as frequent as stated" (``"within"``). Values above zero are evidence against it.
     onsets_per_hour : float
-        The budget, of time in which no vehicle comes into view: what was asked, or what the curve of the
-        model promises at a share that was asked.
+        The budget per hour in which no vehicle comes into view: the requested number, or the number on the
+        curve of the model for a requested share.
     tally : Tally
-        What was counted since the filter began.
+        Numbers since the filter began.
     asked_alpha : float or None
-        Share of hazard-free time in alarm that was asked in place of onsets.
+        Requested share of hazard-free time in alarm, if it was requested instead of a number of onsets.
     promise : AlarmPromise or None
-        Onsets an hour and share of time in alarm of the hazard-free streams on which the curve was measured,
-        at this threshold, and the intervals for other junctions; None of a model file without a curve.
+        Onsets per hour and share of time in alarm at this threshold on the hazard-free streams of the curve,
+        with intervals for other junctions; None if the model file has no curve.
 
     Examples
     --------
@@ -172,66 +173,72 @@ class RiskCue:
 
     .. math:: r_k = P(T_k \le 8\,\mathrm{s} \mid y_{1:t})
 
-    The probability that a vehicle comes into view from there within eight seconds: a marginal of the one
+    The probability that a vehicle comes into view from this direction within 8 s. It is a marginal of the
     belief, never above P(hidden); sides do not exclude each other. With a sequence model it is calibrated.
     Without one it is :math:`\min(P(hid), g(P(hid)))\, P(k \mid hid)` with the calibrated monotone map g of
-    the policy: the sides exclude each other, and when one comes is not known.
+    the policy: then the sides exclude each other, and the time is unknown.
 
     Parameters
     ----------
     direction : str or None
-        Approach side; None if the sound gives no side, as with an array without a model. What rests on a
-        side or on a model (risk, confidence, statistic, hypotheses) is None then, too.
+        Approach side; None if the sound gives no side, as with an array without a model. Then risk,
+        confidence, statistic and hypotheses are None as well.
     azimuth_rad, azimuth_std_rad : float
-        Where to look, coarsely; left positive.
+        Coarse azimuth and its standard deviation, left positive.
     azimuth_source : {"measured", "context"} or None
-        What the azimuth rests on, as that of an `Entity`.
+        Origin of the azimuth, as in `Entity`.
     risk : float or None
-        r_k in [0, 1]; None if no model states it.
+        r_k in [0, 1]; None without a model.
     confidence : float or None
-        P(k | hid): how sure the direction is, given a hidden road user.
+        P(k | hid): probability of this direction, given a hidden road user.
     statistic : float or None
-        s of the last window, all directions together, in [0, 1]; None before the first one.
+        s of the last window, all directions together, in [0, 1]; None before the first window.
     log_lambda : float or None
-        log Lambda of the last window, nats; None before the first one, and if it is infinite.
+        log Lambda of the last window, nats; None before the first window, and if it is infinite.
     hypotheses : Priors or None
-        Probabilities of the explanations. *hidden*: at least one vehicle that is not in line of sight and
-        comes into view within eight seconds or is audible now, whether or not another is in view; *visible*:
-        one in view and none hidden; *none*: neither.
+        Probabilities of the explanations. *hidden*: at least one vehicle is not in line of sight and either
+        comes into view within 8 s or is audible now, whether or not another one is in view; *visible*: one is
+        in view and none is hidden; *none*: neither.
     advisory : Advisory or None
-        Given while the alarm of this side is raised or held. It ends with the hand-over of its vehicle, and
-        none stands beside a risk below .1.
+        Given while the alarm of this side is active. It ends with the hand-over of its vehicle, and is never
+        given with a risk below 0.1.
     alpha : float or None
-        Share of hazard-free time in alarm: of the budget that the rule was calibrated for, or of a sequence's
-        alarm what the curve of its model promises. None of an uncalibrated policy, of messages, and without a
-        curve.
+        Share of hazard-free time in alarm: the budget for which the rule was calibrated, or, for the alarm of
+        a sequence model, the value on the curve of the model. None for an uncalibrated policy, for messages,
+        and without a curve.
     entity_id : str or None
-        The hidden entity that it speaks of, if one was born; of one vehicle whose side is not known the cues
-        of all its sides speak.
+        Id of the hidden entity, if there is one. The cues of all possible sides have the id of a vehicle
+        whose side is unknown.
     horizon_s : float or None
-        Best time to visible where one is stated, else time to arrival of that entity; None where unknown.
+        Best time to visible if stated, otherwise the time to arrival of the entity; None if unknown.
     within : mapping of str to float, or None
-        Probability that a vehicle comes into view from there within so many seconds ("0.5", "1", "2", "3");
-        None without a sequence model.
+        Probability that a vehicle comes into view from this side within 0.5, 1, 2 and 3 s (keys "0.5", "1",
+        "2", "3"); None without a sequence model.
     time_to_visible_s : (float, float, float) or None
-        Low, best and high; the interval holds nine of ten. None where no advisory names the direction and it
-        is likelier than not that none comes within five seconds. Of an announced road user that of its place.
+        Low, best and high estimate, a 90 % interval. None if this side has no advisory and more likely than
+        not no vehicle comes within 5 s. For an announced road user it is derived from its position.
     sector_rad : (float, float) or None
-        Where it is in nine of ten cases: from this azimuth to the left until that one.
+        Right and left end of the 90 % interval of the azimuth.
     evidence : EvidenceTerms or None
-        What an advisory is raised by, piece by piece; None of a side that no source distinguishes.
+        The log-odds of the alarm and their terms; None for a side that no source distinguishes.
     held : Held or None
-        Given where the advisory stands below its threshold, with what for and until when.
+        Given if the advisory continues below its threshold.
     not_advised : str or None
-        If the risk is above 0.5 and no advisory is out, why; or that no source distinguishes this side.
+        Why there is no advisory although the risk is above 0.5, or that no source distinguishes this side.
     usable : bool
-        Whether the cue, its advisory included, may be acted on: exactly if `why_not` is empty.
+        Whether the cue and its advisory may be used: exactly if `why_not` is empty.
     why_not : tuple of str
-        Every reason for which it may not, from a closed list: *uncalibrated*, no budget of false alarms was
-        measured for what decides; *unheard*, no source that listens can hear; *unknown sound*, the model was
-        not made for the sound of this hop; *too little sound*, less than a second so far; *budget broken*, a
-        camera finds more false alarms, or other chances, than stated; *expired*, nothing was measured for a
-        second; *masked*, a vehicle in view, or one that has just left the view, covers the sound.
+        All reasons for which it must not be used: *uncalibrated*, no budget of false alarms was measured for
+        the rule that raises alarms; *unheard*, no array could receive a hidden vehicle; *unknown sound*, the
+        model was not made for the sound of this hop; *too little sound*, less than 1 s so far; *budget
+        broken*, a camera finds more false alarms, or other probabilities, than stated; *expired*, no
+        measurement for 1 s; *masked*, a vehicle in view, or one that has just left the view, covers the
+        sound.
+
+    Attributes
+    ----------
+    began : bool
+        Whether the advisory begins in this state: its onset is the time of the state that holds the cue.
 
     Raises
     ------
@@ -270,7 +277,7 @@ class RiskCue:
     held: Held | None = None
     not_advised: str | None = None
     azimuth_source: AzimuthSource | None = None
-    # Nothing vouches for a cue until `judged` has looked at the snapshot that it stands in.
+    # A cue is not usable until `judged` has evaluated its snapshot.
     usable: bool = False
     why_not: tuple[WhyNot, ...] = ("uncalibrated",)
     # Not written: the state that holds the cue sets it from `advisory` and its own time.

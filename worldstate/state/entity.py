@@ -1,4 +1,4 @@
-"""Entities: road users of the world-state, seen or hidden; their relations, and events in their life."""
+"""Entities: road users of the world-state, in view or hidden; their relations and events."""
 
 import math
 from collections.abc import Mapping
@@ -37,14 +37,14 @@ class Classification:
 
 @dataclass(frozen=True, slots=True)
 class Visibility:
-    """Last answer of the co-evidence channel about an entity.
+    """Last result of the co-evidence channel for an entity.
 
     Parameters
     ----------
     answer : {"visible", "absent", "unqueried"}
-        Found, searched for and not found, or not searched for.
+        Found, searched but not found, or not searched.
     miss_rate : float or None
-        Probability that the channel misses such an entity in view; None where it was not asked.
+        Probability that the channel misses such an entity in view; None if it was not searched.
 
     Examples
     --------
@@ -58,7 +58,7 @@ class Visibility:
 
 @dataclass(frozen=True, slots=True)
 class SideShare:
-    """One part of the azimuth density of a vehicle whose side is not known.
+    """One part of the azimuth density of a vehicle of unknown side.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class SideShare:
     probability : float
         P(it is on this side), given that it exists.
     azimuth_rad, azimuth_std_rad : float
-        Where it is if so; left positive.
+        Its azimuth on this side and the standard deviation, left positive.
 
     Examples
     --------
@@ -83,68 +83,70 @@ class SideShare:
 
 @dataclass(frozen=True, slots=True)
 class Entity:
-    """One road user. Unknown is None, never 0; all quantities are in `base_link`.
+    """One road user. Unknown quantities are None, never 0; all are in the frame `base_link`.
 
     Parameters
     ----------
     id : str
-        UUID, stable for the life of the entity, through occlusion and back into view.
+        UUID, which stays the same through occlusion and hand-over.
     status : {"hidden", "emerged", "visible"} or None
-        Behind an occluder; in line of sight by its sound but not seen; handed over to vision. None if it is
-        only known that something sounds there, as with an array without a model.
+        Behind an occluder; in line of sight by its sound but not detected by a camera; detected by a camera.
+        None if only a direction of sound is known, as with an array without a model.
     existence_probability : float
-        Probability that it exists; before vision has it, P(hidden on its side) + P(in view, come from there).
+        Probability that it exists. Before the hand-over to a camera: P(hidden on its side) + P(in view, from
+        that side).
     hidden_probability : float or None
-        Probability that it exists and is hidden; None if no model states it.
+        Probability that it exists and is hidden; None without a model.
     azimuth_rad, azimuth_std_rad : float
-        Left positive, in (-pi, pi]. Hidden entities have a coarse azimuth: their side is what can be known.
-        Where the side is not known, those of the likelier one.
+        Left positive, in (-pi, pi]. The azimuth of a hidden entity is coarse: only its side can be inferred.
+        If the side is unknown, the values are those of the likelier side.
     created_ns, updated_ns : int
-        First and last time stamps of the belief, ns.
+        Times of the first and the last belief about it, ns.
     classification : tuple of Classification, or None
-        Labels of the signature while hidden, of the detector once seen, and "unknown" for the rest; None if
-        nothing has classified it.
+        Labels of the signature model while hidden, of the detector after the hand-over, and "unknown" for the
+        rest; None if nothing has classified it.
     moving : bool
-        False for an object that vision holds for parked.
+        False if its boxes did not move: a parked vehicle.
     direction : str or None
-        Approach side that it is hidden on, the likelier one where `sides` has several; of one in view, the
-        side it came from, or whose edge it was first seen nearest to. None if its side is not known.
+        Approach side on which it is hidden, the likelier one if `sides` has several. In view: the side from
+        which it came, or the side of the edge nearest to its first detection. None if the side is unknown.
     azimuth_rate_rad_s : float or None
         d azimuth / dt, rad/s; None while hidden.
     range_m : float or None
-        None while it cannot be observed, as from a standing ego without a ranging sensor.
+        None while it is unobservable, as for a standing ego without a ranging sensor.
     position_m : tuple of three floats or None
-        None without a range; of a measured position, unless its standard deviation is below 5 m.
+        None without a range, and while the standard deviation of a measured position is 5 m or more.
     velocity_mps : tuple of three floats or None
         Over ground; None without a measured position, and while its standard deviation exceeds 5 m/s.
     covariance : nested tuple of floats, shape (4, 4), or None
-        Of (x, y, vx, vy), m and m/s; None unless a sensor has measured the position.
+        Covariance of (x, y, vx, vy), m and m/s; None unless a sensor has measured the position.
     time_to_visible_s : (float, float, float) or None
-        Low, best and high of a hidden entity with a position, nine of ten in between; None unless it comes
-        into view within eight seconds in nine of ten cases.
+        Low, best and high estimate for a hidden entity with a position, a 90 % interval; None unless it comes
+        into view within 8 s with 90 % probability.
     inverse_tta_hz, inverse_tta_std_hz : float or None
         1/TTA = -r_dot/r, 1/s, positive while closing, and its standard deviation; None until measured.
     tta_s : float or None
         Time to arrival, s; None unless 1/TTA is positive by more than one standard deviation.
     visibility : Visibility
-        Last answer of the co-evidence channel.
+        Last result of the co-evidence channel.
     sources : tuple of str
         Modalities that contributed.
     last_seen_ns : int or None
-        Last sighting; None if never seen.
+        Time of the last sighting; None if there was none.
     sector_rad : (float, float) or None
-        Where a hidden one is in nine of ten cases: from this azimuth to the left until that one.
+        Right and left end of the 90 % interval of the azimuth of a hidden entity.
     azimuth_covariance : (float, float, float) or None
-        Variance of the azimuth, its covariance with its rate, variance of the rate; None while only heard.
+        Variance of the azimuth, its covariance with the rate, and variance of the rate; None if it was
+        detected by sound only.
     forecast : mapping of str to (float, float), or None
-        Azimuth and its standard deviation in so many seconds ("1", "2") if it goes on as it does; None while
-        only heard: the cue of its side tells when it comes into view.
+        Azimuth and its standard deviation in 1 and 2 s (keys "1", "2") at constant motion; None if it was
+        detected by sound only: `time_to_visible_s` of the cue is the forecast then.
     azimuth_source : {"measured", "context"} or None
-        What the azimuth rests on: a box, a position or bearings; or the context's corners, with the time to
-        visible where a sequence model gives one.
+        Origin of the azimuth: a box, a position or bearings; or the corners of the context, with the time to
+        visible of a sequence model if there is one.
     sides : tuple of SideShare
-        The parts of the azimuth density of one vehicle that may be hidden on several sides; empty where its
-        side is known to nine of ten.
+        The parts of the azimuth density of one vehicle that may be hidden on several sides; empty if one side
+        has at least 90 %.
 
     Examples
     --------
@@ -170,7 +172,7 @@ class Entity:
     classification: tuple[Classification, ...] | None = ()
     moving: bool = True
     direction: str | None = None
-    # None and not 0 from here on: a zero would read as a standing vehicle at the array.
+    # The defaults below are None: 0 would mean a standing vehicle at the array.
     azimuth_rate_rad_s: float | None = None
     range_m: float | None = None
     position_m: Vector | None = None
@@ -195,9 +197,10 @@ class Entity:
         return math.degrees(self.azimuth_rad)
 
     def on_each_side(self) -> tuple["Entity", ...]:
-        """Return an entity of unknown side once for each, as likely as it is there; any other as it is.
+        """Return an entity of unknown side once per side, with the probability of that side.
 
-        The likelier one keeps the id, the others have names of their own that follow from it.
+        The likeliest one keeps the id; the ids of the others are derived from it. An entity of known side is
+        returned unchanged.
         """
         parts = (
             replace(
@@ -223,19 +226,19 @@ EventKind: TypeAlias = Literal["born", "handed_over", "coasting", "hidden_again"
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A change in the life of an entity.
+    """A change of an entity.
 
     Parameters
     ----------
     stamp_ns : int
-        Of the state in which it is first, ns.
+        Time of the first state that has the change, ns.
     kind : {"born", "handed_over", "coasting", "hidden_again", "died", "merged"}
-        Begun; come into view of a sensor that had not seen it; in view before and not found by the last look;
-        seen before and now behind an occluder; dropped; gone on as another one.
+        New; detected by a sensor for the first time after it was hidden; in view before but not found by the
+        last look; in view before and now behind an occluder; dropped; continued as another entity.
     entity_id : str
-        Whose.
+        Id of the entity.
     into : str or None
-        Under which id a merged one goes on; None of all other kinds.
+        Id under which a merged entity continues; None for other kinds.
 
     Examples
     --------
@@ -261,18 +264,18 @@ class Relation:
     src, dst : str
         Ids of entities or occluders, or ``"ego"``.
     kind : str
-        ``"occluded_by"``, ``"approaching_from"`` and ``"emerged_from"`` lead to an occluder,
-        ``"approaching"`` and ``"conflicts_with_ego_path"`` (on the path ahead of it within five seconds) to
-        the ego vehicle, ``"same_lane"`` and ``"in_front_of"`` to what an entity is next ahead of, the ego
-        vehicle or another entity; these three are told of entities with a position.
+        ``"occluded_by"``, ``"approaching_from"`` and ``"emerged_from"`` lead to an occluder;
+        ``"approaching"`` and ``"conflicts_with_ego_path"`` (on the path ahead of it within 5 s) lead to the
+        ego vehicle; ``"same_lane"`` and ``"in_front_of"`` lead to the next object behind the entity, the ego
+        vehicle or another entity. The last three exist only for entities with a position.
     probability : float
-        Probability that it holds, given that both ends exist; of ``"emerged_from"``, that the detection at
-        the hand-over was of the entity that was hidden there.
+        Probability that the relation holds, given that both ends exist; for ``"emerged_from"``, that the
+        detection at the hand-over belongs to the entity that was hidden there.
     stamp_ns : int
         Time of the belief, ns.
     since_ns, until_ns : int or None
-        Interval in which the probability was last at least .5, ns; the first is None if it never was, the
-        second while it is. Both are forgotten five seconds after its end.
+        Last interval in which the probability was at least 0.5, ns. `since_ns` is None if there was none,
+        `until_ns` during it. Both become None 5 s after its end.
 
     Examples
     --------

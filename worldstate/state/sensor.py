@@ -1,4 +1,4 @@
-"""Sensors of a snapshot: health, last views, order of delivery, and the ego vehicle by its odometry."""
+"""Sensors of a snapshot: health, last looks, order of delivery, and the ego vehicle by its odometry."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,23 +7,23 @@ from typing import Literal, TypeAlias
 from worldstate.ground.serialisation import ADDED, Count, Probability
 
 Condition: TypeAlias = Literal["working", "impaired", "silent"]
-MASKED = "masked by a vehicle in view"  # Reason of a Hearing, which the sensor itself is not to blame for
+MASKED = "masked by a vehicle in view"  # A reason of `Hearing` that is no fault of the sensor
 
 
 @dataclass(frozen=True, slots=True)
 class SensorHealth:
-    """How a sensor is, by what it said last.
+    """Health of a sensor, by its last measurement or look.
 
     Parameters
     ----------
     sensor : str
-        Source of measurements, or the sensor whose looks they carried.
+        Source of measurements, or the sensor whose looks were part of them.
     condition : {"working", "impaired", "silent"}
-        Silent after a second without a measurement or a look; impaired where something is known to be wrong.
+        Silent after one second without a measurement or a look; impaired if a fault is known.
     stamp_ns : int
-        Of its last measurement or look, ns.
+        Time of its last measurement or look, ns.
     reason : str or None
-        What is wrong; None where nothing is known to be.
+        The known fault, or None.
 
     Examples
     --------
@@ -39,22 +39,22 @@ class SensorHealth:
 
 @dataclass(frozen=True, slots=True)
 class Hearing:
-    """How well a sensor that listens could hear: what it did not hear is evidence only that far.
+    """How well an array could receive a hidden vehicle: its silence is evidence only to this degree.
 
     Parameters
     ----------
     sensor : str
         Source of measurements.
     share : float
-        Probability that a hidden vehicle would have been noticed.
+        Probability that a hidden vehicle would have been detected.
     since_ns : int
-        Since when it has been what it is, ns.
+        Time since which the share has had this value, ns.
     reason : str or None
-        What keeps it from hearing; None where nothing does.
+        Why the share is reduced, or None.
     kinds : mapping of str to float, or None
-        Of each kind of road user, the share of approaches that would be noticed now: what the simulated exam
-        of the model detected at the budget of its file, times `share`. None if the model's card has no such
-        shares, its sequence model is not used, or nothing can be heard.
+        For each kind of road user, the share of approaches that would be detected now: the share detected in
+        the simulated exam of the model at the budget of its file, times `share`. None if the model card has
+        no such shares, the sequence model is not used, or `share` is 0.
 
     Examples
     --------
@@ -71,20 +71,20 @@ class Hearing:
 
 @dataclass(frozen=True, slots=True)
 class SearchedView:
-    """The last look of a sensor: where it searched, whether anything was there, and how often it errs.
+    """The last look of a sensor: the searched sector, its result, and the error rates.
 
     Parameters
     ----------
     sensor : str
-        The one that looked.
+        Name of the sensor.
     stamp_ns : int
-        When, ns.
+        Time of the look, ns.
     found : bool
-        Whether anything that moves was there.
+        Whether a moving object was found.
     miss_rate, clutter_rate : float
-        Probability to miss what is in view, and to find what is not.
+        Probability of a missed vehicle in view, and of a false detection.
     sector_rad : (float, float)
-        From this azimuth to the left until that one.
+        Azimuths of the right and the left end of the searched sector.
 
     Examples
     --------
@@ -107,15 +107,16 @@ class Ego:
     Parameters
     ----------
     position_m : (float, float)
-        Of `base_link` in the map frame, m.
+        Position of `base_link` in the map frame, m.
     yaw_rad : float
-        Its x axis, counter-clockwise from that of the map.
+        Azimuth of its x axis in the map frame, counter-clockwise.
     covariance : nested tuple of floats, shape (3, 3)
-        Of (x, y, yaw).
+        Covariance of (x, y, yaw).
     speed_mps, yaw_rate_rad_s : float
-        Along its x axis and about its z axis, left positive.
+        Speed along its x axis and rate about its z axis, left positive.
     localised : bool
-        Whether odometry has told the pose; else it is added up from where the first speed found the vehicle.
+        Whether odometry contains the pose; otherwise the pose is integrated from the place of the first
+        speed.
 
     Examples
     --------
@@ -133,26 +134,26 @@ class Ego:
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """What has been wrong with the order of measurements since the filter began.
+    """Numbers of faulty deliveries since the filter began.
 
     Parameters
     ----------
     replayed : int
-        Late ones, with a stamp before one already taken, that were put where they belong.
+        Late measurements within the lag of the filter, which were inserted at their own time.
     repeated : int
-        Delivered before, and dropped.
+        Repeated measurements, which were dropped.
     too_late : int
-        Later than the filter's lag, and dropped.
+        Measurements later than the lag of the filter, which were dropped.
     reanchored : int
-        Times that everything came too late for a second, by clocks that changed, and the belief began anew.
+        Restarts of the belief after all measurements of one second were too late because a clock had changed.
     held_back : int
-        Ahead of all others by more than the filter's lag, and not confirmed by another one.
+        Measurements more than the lag ahead of all others, which no other measurement has confirmed.
     boxes_left_out : int
-        Boxes beyond the 64 of an image that count, of which moving ones and high scores go first.
+        Boxes beyond the 64 that are used of an image; moving boxes and high scores are preferred.
     tracks_left_out : int
-        Entities given up beyond the 128 likeliest.
+        Entities dropped beyond the 128 likeliest.
     refused : int
-        Inputs of a running source that were unreadable, impossible, late, repeated or of a stranger.
+        Inputs of a running source that were unreadable, impossible, late, repeated or of an unknown sender.
 
     Examples
     --------

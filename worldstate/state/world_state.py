@@ -34,52 +34,51 @@ class WorldState:
     stamp_ns : int
         Time of the state, ns on `clock`.
     seq : int
-        Measurements taken in so far.
+        Number of measurements so far.
     entities : tuple of Entity
-        Kept in order of birth.
+        In order of birth.
     relations : tuple of Relation
-        Kept in order of their ends and kind.
+        In order of their ends and kind.
     context : Context
-        With the probabilities of the explanations before the last evidence as its priors.
+        The place. Its priors are the probabilities of the explanations before the last evidence.
     cues : tuple of RiskCue
-        One per direction, none before the first measurement; kept in order of direction.
+        One per direction, in order of direction; none before the first measurement.
     frame_id : str
         Axes of all quantities: x forward, y left, z up.
     clock : {"media", "unix", "monotonic"}
-        What `stamp_ns` counts from.
+        Clock of `stamp_ns`: from the start of the recording, from 1970, or from an arbitrary time.
     calibrated : bool
-        Whether the cues hold to a false-alarm budget, of a model that is used for what it was made for; where
-        it is not, no cue states an alpha. False, too, while nothing can be heard or the budget is broken: it
-        is false exactly if a cue is *uncalibrated*, *unheard* or *budget broken*.
+        Whether the cues keep a budget of false alarms, with a model that was made for this array. It is false
+        exactly if a cue is *uncalibrated*, *unheard* or *budget broken*; then no cue states an alpha.
     bearing : Bearing or None
-        Loudest source of the last measurement, with its standard deviation; None where it had no bearing.
+        Loudest direction of the last measurement, with its standard deviation; None if it had none.
     domain : Familiar, Foreign, WarningSignal or None
-        Whether the model was made for what was heard last. Of a foreign sound it gives the reason, and the
-        evidence of that hop counts little; a warning signal comes from a vehicle.
+        Whether the model was made for the sound of the last hop. `Foreign` has the reason, and the evidence
+        of that hop is reduced; a warning signal comes from a vehicle.
     no_sequence : NotUsable or None
         Why the cues state no times.
     delivery : Delivery
-        Measurements that came late, twice, or too late.
+        Number of measurements that arrived late, twice, or too late.
     valid_until_ns : int or None
-        A second after the last measurement, ns: a reader must not use the state after that. None before the
-        first.
+        One second after the last measurement, ns: a reader must not use the state after that. None before the
+        first measurement.
     sensors : tuple of SensorHealth
-        How every sensor is, in order of their names.
+        Health of every sensor, in order of names.
     searched : tuple of SearchedView
-        The last look of every sensor that looks, in order of their names.
+        The last look of every camera and other searching sensor, in order of names.
     ego : Ego or None
-        Pose and twist of the ego vehicle; None without odometry. With it the context's occluders, too, are
-        as they are seen from there.
+        Pose and twist of the ego vehicle; None without odometry. With odometry the occluders of the context
+        are given as seen from this pose.
     heard : tuple of Hearing, or None
-        How well each sensor that listens could hear; None where none does.
+        How well each array could receive a hidden vehicle; None without an array.
     budget : Budget or None
-        Whether the budget of alarms still holds, by what a camera sees later; None without the alarm of a
-        sequence model, which has one.
+        Whether the alarms keep their budget, judged by the vehicles that a camera detects later; None without
+        a sequence model.
     no_model : NotUsable or None
-        Why no model reads the sound, if none does: an array that no model was made for. The entities that are
-        heard then have no status, side and class, the cues no side, risk and advisory.
+        Why no model reads the sound: no model was made for this array. Entities detected by sound then have
+        no status, side or class, and cues have no side, risk or advisory. None with a model.
     events : tuple of Event
-        What became of entities with the last measurement, at most 64.
+        Changes of entities at the last measurement, at most 64.
 
     Examples
     --------
@@ -113,7 +112,7 @@ class WorldState:
     no_model: NotUsable | None = field(default=None, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        # Order carries no meaning, so it must not make two equal states differ.
+        # The order has no meaning, and must not make two equal states different.
         entities = sorted(self.entities, key=lambda entity: (entity.created_ns, entity.id))
         relations = sorted(self.relations, key=lambda edge: (edge.src, edge.dst, edge.kind, edge.stamp_ns))
         object.__setattr__(self, "entities", tuple(entities))
@@ -162,7 +161,7 @@ class WorldState:
         >>> sorted(graph.nodes), graph.edges["corner_left", "ego", "left_of"]["probability"]
         (['corner_left', 'corner_right', 'ego'], 1.0)
         """
-        # Imported here: it takes .2 s, and few ask for a graph.
+        # Imported here: the import takes 0.2 s, and most programs need no graph.
         graph: nx.MultiDiGraph = optional("networkx").MultiDiGraph()
         graph.add_node(EGO, type="ego", value=self.context)
         for occluder in self.context.occluders:
@@ -180,7 +179,7 @@ class WorldState:
         Parameters
         ----------
         axes : matplotlib.axes.Axes, optional
-            Drawn on; without it on a new figure of pyplot.
+            The axes to draw on; by default those of a new figure of pyplot.
 
         Returns
         -------
@@ -197,7 +196,7 @@ class WorldState:
         >>> WorldState(1_500_000_000, 0).plot().get_title(loc="left")[:5]
         '1.5 s'
         """
-        # The drawing lies in a higher layer, which only this call needs.
+        # The drawing is in a higher layer, which nothing else in this package needs.
         drawn: Axes = import_module("worldstate.operations.viewing.state_figure").draw_state(self, axes)
         return drawn
 
@@ -211,10 +210,10 @@ class WorldState:
         Raises
         ------
         InvalidArgumentError
-            If a number is NaN or infinite, which JSON cannot say.
+            If a number is NaN or infinite, which JSON cannot hold.
         """
         try:
-            # A tree holds no circles: looking for them takes a tenth of the time.
+            # A snapshot has no circular references; the check for them takes a tenth of the time.
             return json.dumps(self.to_dict(), allow_nan=False, check_circular=False, separators=(",", ":"))
         except ValueError as error:
             raise InvalidArgumentError(f"snapshot: expected finite numbers ({error})") from error
@@ -223,14 +222,14 @@ class WorldState:
     def from_dict(cls, value: object) -> "WorldState":
         """Return the snapshot that `to_dict` wrote; unknown keys are ignored.
 
-        One of schema 3.x is upgraded: what it holds decides whether its cues are usable.
+        A snapshot of schema 3.x is upgraded, and `usable` of its cues is computed from its other fields.
 
         Raises
         ------
         SchemaVersionError
             On another schema or another major version.
         InvalidArgumentError
-            If a value is missing, of the wrong type or out of range; the message says where.
+            If a value is missing, of the wrong type or out of range; the message has its place.
         """
         return _upgraded(value) if is_former(value) else decode(cls, value, "snapshot")
 
@@ -240,17 +239,17 @@ class WorldState:
         return cls.from_dict(decode_json(text, "snapshot"))
 
 
-# Reasons for which a budget of alarms does not hold, so that a state is not calibrated.
+# Reasons for which no budget of alarms holds, so that a state is not calibrated.
 _NO_BUDGET = {"uncalibrated", "unheard", "budget broken"}
 
 
 def why_not(state: WorldState) -> tuple[WhyNot, ...]:
-    """Return why the cues of a snapshot may not be acted on, all reasons that apply in the order of `WhyNot`.
+    """Return all reasons for which the cues of a snapshot must not be used, in the order of `WhyNot`.
 
     Parameters
     ----------
     state : WorldState
-        With `calibrated` true if a budget was measured for what decides.
+        With `calibrated` true if a budget was measured for the rule that raises alarms.
 
     Examples
     --------
@@ -260,7 +259,7 @@ def why_not(state: WorldState) -> tuple[WhyNot, ...]:
     hearing = [one for one in state.heard or () if one.share >= LEAST_HEARD]
     applies: dict[WhyNot, bool] = {
         "uncalibrated": not state.calibrated,
-        # What could not be heard is no evidence, and no budget was measured without it.
+        # An unusable hop is no evidence, and no budget was measured for such hops.
         "unheard": state.heard is not None and not hearing,
         "unknown sound": isinstance(state.domain, Foreign),
         "too little sound": state.no_sequence == TOO_FEW,
@@ -272,7 +271,7 @@ def why_not(state: WorldState) -> tuple[WhyNot, ...]:
 
 
 def judged(state: WorldState) -> WorldState:
-    """Return a snapshot whose cues, and `calibrated`, follow from `why_not`.
+    """Return a snapshot with `usable` and `why_not` of its cues, and `calibrated`, set by `why_not`.
 
     Examples
     --------
@@ -284,7 +283,7 @@ def judged(state: WorldState) -> WorldState:
     """
     reasons = why_not(state)
     cues = tuple(
-        # Of a side that no source distinguishes nothing was measured.
+        # No budget was measured for a side that no source distinguishes.
         replaced(cue, usable=not why, why_not=why)
         for cue in state.cues
         for why in [reasons or (() if cue.evidence else ("uncalibrated",))]
@@ -293,7 +292,7 @@ def judged(state: WorldState) -> WorldState:
 
 
 def is_former(value: object) -> bool:
-    """Tell whether a decoded snapshot is one of schema 3.x, which is upgraded when it is read.
+    """Return whether a decoded snapshot is of schema 3.x, which is upgraded when it is read.
 
     Examples
     --------
@@ -306,14 +305,14 @@ def is_former(value: object) -> bool:
 
 
 def _upgraded(value: Any) -> WorldState:
-    """Return the snapshot that is written in a value of schema 3.x."""
-    # Two fields that were always 0 are gone, and unknown keys are ignored; the cues' new ones follow below.
+    """Return the snapshot that a value of schema 3.x holds."""
+    # Two fields that were always 0 are ignored as unknown keys; the new fields of the cues are set below.
     cues, new = value.get("cues"), {"usable": False, "why_not": ["uncalibrated"]}
     if isinstance(cues, list):
         cues = [one | new if isinstance(one, dict) else one for one in cues]
     schema = {"name": WorldState.LAYOUT.schema, "version": WorldState.LAYOUT.version}
     state = decode(WorldState, value | {"schema": schema, "cues": cues}, "snapshot")
-    # `calibrated` was false while nothing was heard, or the budget was broken, even if one was measured.
+    # `calibrated` was false during unusable hops and with a broken budget, even if a budget was measured.
     stated = state.budget is not None or any(cue.alpha is not None for cue in state.cues)
     lost = not _NO_BUDGET.isdisjoint(why_not(replaced(state, calibrated=True)))
     return judged(replaced(state, calibrated=state.calibrated or (stated and lost)))
@@ -325,7 +324,7 @@ def snapshot_schema() -> dict[str, Any]:
     Returns
     -------
     dict
-        For any validator; unknown keys are allowed.
+        The schema, for any validator; unknown keys are allowed.
 
     Examples
     --------
