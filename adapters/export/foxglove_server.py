@@ -1,4 +1,4 @@
-"""Foxglove on a websocket: what may connect, and what a viewer costs that does not take what it is sent."""
+"""Foxglove's server on a websocket: which viewers may connect, and how slow viewers are treated."""
 
 import io
 import logging
@@ -21,32 +21,28 @@ from .log_messages import LogMessage, LogSink
 _LOG = logging.getLogger(__name__)
 HOST = "127.0.0.1"
 MOST_VIEWERS = 8
-# Connections of one address, and of all, that have not asked yet: the oldest makes room for the newest. A
-# viewer asks at once, so that those which send a byte now and then keep no viewer out.
+# Most connections of one address, and of all, without a request so far: the newest replaces the oldest. A
+# viewer sends its request at once, so connections that send a byte now and then cannot block viewers.
 MOST_ASKING, MOST_ASKING_OF_ALL = 8, 64
-# Messages that wait for a viewer: three seconds of hops. The oldest makes room for the newest.
+# Most messages that wait for a viewer, 3 s of hops: the newest replaces the oldest.
 MOST_WAITING = 100
-# A viewer that takes nothing for so long is disconnected.
+# A viewer that reads nothing for this time is disconnected.
 STALLED_S = 10.0
-# A viewer has so long for its whole head.
+# Longest time for the head of a request.
 _HEAD_S, _HEAD_BYTES, _BLOCK_BYTES, _POLL_S = 5.0, 1 << 13, 1 << 16, 0.2
 _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 def is_trusted(origin: str | None, named: Collection[str] = ()) -> bool:
-    """Whether a program of this machine asks, a page that it serves, or one of the origins that are named.
+    """Return whether a request comes from a program or a page of this machine, or from an allowed origin.
 
-    A page of the web has an origin with its host, a page in a sandbox the origin ``null``; programs have
-    none, or one of their own scheme.
+    The origin of a web page has its host, that of a page in a sandbox is ``null``. Programs have no origin,
+    or one with a scheme of their own.
 
-    Examples
-    --------
-    >>> is_trusted(None), is_trusted("http://localhost:8080"), is_trusted("file://")
-    (True, True, True)
-    >>> is_trusted("https://app.foxglove.dev"), is_trusted("null"), is_trusted("http://localhost.evil.example")
-    (False, False, False)
-    >>> is_trusted("https://app.foxglove.dev", ["https://app.foxglove.dev"])
-    True
+    Examples -------- >>> is_trusted(None), is_trusted("http://localhost:8080"), is_trusted("file://") (True,
+    True, True) >>> is_trusted("https://app.foxglove.dev"), is_trusted("null"),
+    is_trusted("http://localhost.evil.example") (False, False, False) >>>
+    is_trusted("https://app.foxglove.dev", ["https://app.foxglove.dev"]) True
     """
     if origin is None or origin in named:
         return True
@@ -60,30 +56,30 @@ def is_trusted(origin: str | None, named: Collection[str] = ()) -> bool:
 
 
 class OriginGate:
-    """Takes viewers at a port, and joins those that may see the states to a server behind it.
+    """Accept viewers at a port, and connect those that are allowed to a server behind it.
 
-    Foxglove's server takes every origin, and a browser lets any page connect to a port of its machine.
+    Foxglove's server accepts every origin, and browsers let any page connect to a port of the same machine.
 
     Parameters
     ----------
     port : int
-        Where viewers connect; 0 takes a free one.
+        Port for viewers; 0 selects a free one.
     server : (str, int)
         Host and port of the server.
     origins : collection of str
-        Of web pages that may connect, such as ``https://app.foxglove.dev``.
+        Origins of web pages that may connect, such as ``https://app.foxglove.dev``.
 
     Attributes
     ----------
     refused : int
-        Connections that were refused: of another origin, no websocket, or one too many.
+        Number of refused connections: of another origin, not a websocket, or beyond the limit.
     stalled : int
-        Viewers that were disconnected because they took nothing.
+        Number of viewers that were disconnected because they read nothing.
 
     Raises
     ------
     InvalidArgumentError
-        If the port is none, or taken.
+        If the port is invalid or in use.
     """
 
     def __init__(self, port: int, server: tuple[str, int], origins: Collection[str] = ()) -> None:
@@ -116,19 +112,19 @@ class OriginGate:
         while not self._stopped.is_set():
             try:
                 viewer, (address, _) = self._listening.accept()
-            except OSError:  # no viewer came, or it has gone
+            except OSError:  # no viewer, or it has disconnected
                 continue
             self._make_room(address)
             self._asking.append((address, viewer))
             threading.Thread(target=self._serve, args=(address, viewer), daemon=True).start()
 
     def _make_room(self, address: str) -> None:
-        """Hang up on what has waited longest where too many wait."""
+        """Close the oldest waiting connections if too many wait."""
         every = list(self._asking)
         same = [one for one in every if one[0] == address]
         if len(same) >= MOST_ASKING or len(every) >= MOST_ASKING_OF_ALL:
             oldest = (same if len(same) >= MOST_ASKING else every)[0]
-            with suppress(ValueError):  # it has asked meanwhile
+            with suppress(ValueError):  # its request has arrived meanwhile
                 self._asking.remove(oldest)
                 self.refused += 1
                 _hang_up(oldest[1])
@@ -138,7 +134,7 @@ class OriginGate:
             try:
                 head = _head(viewer)
             finally:
-                with suppress(ValueError):  # it made room
+                with suppress(ValueError):  # closed for a newer one
                     self._asking.remove((address, viewer))
             if not (_may_connect(head, self._origins) and self._places.acquire(blocking=False)):
                 self._refuse(viewer)
@@ -160,7 +156,7 @@ class OriginGate:
             viewer.sendall(_REFUSED)
 
     def _join(self, viewer: socket.socket, server: socket.socket) -> None:
-        """Pass on what both send until one of them ends."""
+        """Forward the data of both until one of them ends."""
         viewer.settimeout(STALLED_S)
         server.settimeout(STALLED_S)
         asks = threading.Thread(target=_pass_on, args=(viewer, server, self._stopped), daemon=True)
@@ -174,12 +170,12 @@ class OriginGate:
 
 
 def _pass_on(source: socket.socket, target: socket.socket, stopped: threading.Event) -> None:
-    """Pass on what a socket sends until it ends or the run does; raise TimeoutError where it is not taken."""
+    """Forward the data of a socket until it or the run ends; raise TimeoutError for a slow receiver."""
     with suppress(ConnectionError):
         while not stopped.is_set():
             try:
                 block = source.recv(_BLOCK_BYTES)
-            except TimeoutError:  # it has nothing to say
+            except TimeoutError:  # it sends nothing
                 continue
             if not block:
                 break
@@ -193,7 +189,7 @@ def _hang_up(one: socket.socket) -> None:
 
 
 def _head(viewer: socket.socket) -> bytes:
-    """Return what a viewer asks with, up to the empty line; a viewer that sends none is left."""
+    """Return the head of a viewer's request, up to the empty line; drop a viewer that sends none."""
     head, until_s = b"", time.monotonic() + _HEAD_S
     while not head.endswith(b"\r\n\r\n"):
         viewer.settimeout(max(until_s - time.monotonic(), 1e-3))
@@ -215,13 +211,13 @@ def _may_connect(head: bytes, named: Collection[str]) -> bool:
 def live_server(
     port: int, *, paced: bool = True, origins: Collection[str] = ()
 ) -> Iterator[tuple[LogSink, int]]:
-    """Lend a function that sends messages to connected viewers, and the port; 0 takes a free one.
+    """Yield a function that sends messages to connected viewers, and the port; 0 selects a free one.
 
-    What comes sooner than its stamp says is held back, so that a recording plays at the speed of its sound;
-    not so where `paced` is False: microphones that run set the pace themselves. A viewer never holds a
-    message back: what it does not take is dropped. For `origins` see `OriginGate`.
+    Each message is delayed until its time stamp, so that a recording plays at the speed of its sound. With
+    `paced` False there is no delay, as for microphones, which set the pace themselves. A slow viewer delays
+    no message: messages that it does not read are dropped. For `origins` see `OriginGate`.
     """
-    # A context of its own: the global one keeps its channels for all servers of the process.
+    # A separate context: the global one keeps its channels for all servers of the process.
     context = optional("foxglove").Context()
     server, host = _hidden_server(context)
     channels: dict[str, Any] = {}
@@ -245,10 +241,10 @@ def live_server(
 
 
 def _hidden_server(context: Any) -> tuple[Any, str]:
-    """Start Foxglove's server at an address that only the gate knows; return both.
+    """Start Foxglove's server at an address that only the gate has; return both.
 
-    Linux has 2^24 addresses of this machine: with the port too many for a page to try. Where there is one
-    only, the port alone is unknown.
+    Linux has 2^24 loopback addresses; together with the port these are too many for a page to try. On a
+    system with one such address only the port is unknown.
     """
     start = partial(optional("foxglove").start_server, name="worldstate", port=0, context=context)
     host = "127." + ".".join(str(secrets.randbelow(254) + 1) for _ in range(3))

@@ -1,4 +1,4 @@
-"""What a viewer or a log is given of a hop, and where it goes: MCAP files, Rerun."""
+"""Messages of a hop for viewers and logs, and the writers of MCAP files and Rerun recordings."""
 
 import base64
 import json
@@ -43,7 +43,7 @@ Told: TypeAlias = (
 
 @dataclass(frozen=True, slots=True)
 class LogMessage:
-    """One message, which viewers and logs are given as JSON text."""
+    """One message, in JSON, for viewers and logs."""
 
     topic: str
     stamp_ns: int
@@ -51,7 +51,7 @@ class LogMessage:
 
     @property
     def data(self) -> bytes:
-        """The text; of a snapshot as `WorldState.to_json` writes it."""
+        """The JSON text; for a snapshot that of `WorldState.to_json`."""
         if isinstance(self.value, WorldState):
             return self.value.to_json().encode()
         written = encode(self.value)
@@ -60,7 +60,7 @@ class LogMessage:
     @property
     def schema_name(self) -> str:
         """Name of the type of the value."""
-        # What is drawn is named as Foxglove names it.
+        # Drawings have the names of Foxglove's types.
         own = isinstance(self.value, WorldState)
         return "worldstate.Snapshot" if own else f"foxglove.{type(self.value).__name__}"
 
@@ -77,7 +77,7 @@ LogSink: TypeAlias = Callable[[LogMessage], None]
 
 
 def state_messages(state: WorldState) -> Iterator[LogMessage]:
-    """Yield a snapshot as `WorldState.to_json` writes it, its scene, and with odometry its frame in the map.
+    """Yield the snapshot (JSON of `WorldState.to_json`), its scene, and with odometry its frame in the map.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def srp_message(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) ->
 
 
 def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterator[LogMessage]]:
-    """Return what yields the last image before a stamp, asked in order of time, if it is a new one."""
+    """Return a function that yields the last image before a stamp if it is new; stamps must increase."""
     path = recording / VIDEO_NAME
     if not path.is_file():
         return lambda stamp_ns: iter(())
@@ -126,14 +126,14 @@ def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterato
 def recorded_sound(
     sound: SoundInput, start_ns: int = 0, channels: Sequence[int] = ()
 ) -> Iterator[Callable[[int], Iterator[LogMessage]]]:
-    """Lend what yields the sound of one microphone up to a stamp, asked in order of time; of files only."""
+    """Yield a function that yields the sound of one microphone of a file up to increasing stamps."""
     if not isinstance(sound, Path | tuple):
         yield lambda stamp_ns: iter(())
         return
     with open_sound(sound, channels=channels, strict=False) as audio:
         rate_hz, taken = audio.sample_rate_hz, 0
         blocks = audio.blocks(rate_hz // 10)
-        # Silent channels are counted from 1.
+        # Silent channels are numbered from 1.
         heard = next(i for i in range(audio.channels) if i + 1 not in audio.silent_channels)
 
         def sound_until(stamp_ns: int) -> Iterator[LogMessage]:
@@ -167,7 +167,7 @@ TIMELINE = "stream"
 
 @contextmanager
 def rerun_file(path: Path) -> Iterator[LogSink]:
-    """Lend a function that writes messages to a Rerun recording, which takes its name when the block ends."""
+    """Yield a function that writes messages to a Rerun recording, which is named at the end of the block."""
     rr = optional("rerun")
     with atomic_path(path) as temporary:
         recording = rr.RecordingStream("worldstate")
@@ -186,7 +186,7 @@ def rerun_file(path: Path) -> Iterator[LogSink]:
 
 
 def _drawn(rr: ModuleType, topic: str, value: Told) -> Iterator[tuple[str, object]]:
-    """Yield what is drawn of a message, each with its place; what an earlier scene drew is removed."""
+    """Yield the drawings of a message with their paths; drawings of earlier scenes are removed."""
     if isinstance(value, WorldState):
         yield topic, rr.TextDocument(value.to_json(), media_type="application/json")
     elif isinstance(value, scene.CompressedImage):
@@ -240,10 +240,11 @@ def _colors(
 
 @contextmanager
 def mcap_file(path: Path, opener: FileOpener = whole_file) -> Iterator[LogSink]:
-    """Lend a function that writes messages to an MCAP file.
+    """Yield a function that writes messages to an MCAP file.
 
-    It takes its name when the block ends; of a `GrowingFile`, which has it before, a killed run loses half a
-    second. One that could not be written ends with its last whole chunk: its index counts bytes.
+    The file gets its name at the end of the block. A `GrowingFile` has its name from the start, and a killed
+    run loses half a second of it. After a write error the file ends with its last complete chunk, as its
+    index contains byte offsets.
     """
     check_extra("mcap")
     with opener(path) as file:
@@ -264,13 +265,13 @@ def mcap_file(path: Path, opener: FileOpener = whole_file) -> Iterator[LogSink]:
             messages.finish()
 
 
-# Whole chunks of an unfinished file are read: a killed run loses at most so much of its stream.
+# Only complete chunks of an unfinished file are read: a killed run loses at most this time of its stream.
 _CHUNK_NS = nanoseconds(0.5)
 _CHUNK_BYTES = 1 << 20
 
 
 class _ChunkLimit:
-    """Size of a chunk: the writer compares it after every message, and time may have passed as well."""
+    """Size limit of a chunk, which the writer compares after every message; it drops to 0 with time."""
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
@@ -307,14 +308,14 @@ class _McapMessages:
 
 _LOG = logging.getLogger(__name__)
 MCAP_MENDED = "`mcap recover IN -o OUT`"
-# Half a second of states with an image takes a hundredth of it.
+# Half a second of states with images takes a hundredth of it.
 _LARGEST_RECORD = 1 << 28
 
 
 def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
-    """Yield stamp, topic and text of messages of an MCAP file, in the order of their writing.
+    """Yield stamp, topic and text of the messages of an MCAP file, in the order of writing.
 
-    Of a file that was cut short, anywhere, those are read whose chunk is whole.
+    From a truncated file the messages of complete chunks are read.
     """
     reader, cut_short = optional("mcap.reader").NonSeekingReader, optional("mcap.exceptions").EndOfFile
     check_chunks(path)
@@ -329,9 +330,7 @@ def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
                     yield message.log_time, channel.topic, message.data.decode()
         except GeneratorExit:
             raise
-        except (
-            Exception
-        ) as error:  # zstandard, lz4 and struct each have errors of their own for damaged bytes
+        except Exception as error:  # zstandard, lz4 and struct raise different errors for damaged bytes
             cut = isinstance(error, (cut_short, struct.error)) and _is_cut(path)
             if not (found and cut):
                 said = str(error) * (not cut) or "it ends before its first whole chunk"
@@ -341,7 +340,7 @@ def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
 
 
 def _is_cut(path: Path) -> bool:
-    """Return whether an MCAP file does not end as one, with its magic number behind the last record."""
+    """Return whether an MCAP file is truncated: it does not end with the magic number."""
     with path.open("rb") as file:
         magic = file.read(_MAGIC_BYTES)
         while len(head := file.read(_RECORD.size)) == _RECORD.size:
@@ -350,29 +349,29 @@ def _is_cut(path: Path) -> bool:
 
 
 MCAP_MAGIC = b"\x89MCAP"
-# Of an MCAP file: its magic number, the head of every record, and that of a chunk up to its compression.
+# MCAP: the magic number, the head of every record, and the head of a chunk up to its compression.
 _MAGIC_BYTES, _RECORD, _CHUNK, _CHUNK_HEAD = 8, struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
-# Of a message: its channel and number, then its time.
+# Message: its channel and number, then its time.
 _MESSAGE, _MESSAGE_HEAD = 5, struct.Struct("<6xQ")
-# Of the index of a chunk: its first and last time and where it stands; its last 16 bytes are its sizes.
+# Index of a chunk: its first and last time and its offset; the last 16 bytes are its sizes.
 _INDEX, _INDEX_HEAD, _INDEX_SIZES = 8, struct.Struct("<QQQ"), struct.Struct("<QQ")
-# Readers of bags hold every chunk whose times overlap, decoded.
+# Readers of bags keep all chunks with overlapping times in memory, decoded.
 _MOST_AT_ONCE = 1 << 29
 
 
 def check_chunks(path: Path) -> None:
-    """Refuse an MCAP file with a chunk that fills the memory, or with an index of something else.
+    """Refuse an MCAP file with a chunk that fills the memory, or with an index that contradicts its chunks.
 
-    Neither the reader of MCAP nor that of bags has a bound, and what a frame states of its own size may be
-    wrong, missing, or followed by another frame. So a chunk is decoded here first, up to the size it claims.
-    The index, from which bags are read, has to name these chunks and no other bytes of the file, and times
-    between which all of their messages lie: readers of bags leave out the others.
+    The readers of MCAP and of bags have no limit, and the stated size of a compressed frame may be wrong,
+    missing, or followed by another frame. Therefore each chunk is decoded here first, up to its stated size.
+    Bags are read by the index. It must list exactly these chunks, and its time ranges must contain all of
+    their messages, since readers of bags omit messages outside of them.
     """
     about = path.stat()
     _check_chunks(path, about.st_size, about.st_mtime_ns)
 
 
-@lru_cache(maxsize=8)  # a bag is opened several times in a run, and decoding takes seconds a gigabyte
+@lru_cache(maxsize=8)  # a run opens a bag several times, and decoding takes seconds per gigabyte
 def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
     chunks, times = dict[int, tuple[tuple[int, int], tuple[int, ...]]](), list[tuple[int, int, int]]()
     with plain_file(path, "an MCAP file") as file:
@@ -392,7 +391,7 @@ def _check_chunks(path: Path, end: int, modified_ns: int) -> None:
                     problem = f"expected an index with the times of its messages, got {first} to {last} ns"
                     raise InputFileError(path, problem)
                 times += [(first, 0, sizes[1]), (last, 1, -sizes[1])]
-            # What was cut short the readers refuse or leave out before they decode it.
+            # Readers refuse or omit truncated records before they decode them.
             if kind == _CHUNK and length >= _CHUNK_HEAD.size and at <= end:
                 head = file.read(_CHUNK_HEAD.size)
                 claimed = int(_CHUNK_HEAD.unpack(head)[2])
@@ -414,7 +413,7 @@ def _compressed_bytes(chunk: bytes) -> int:
 
 
 def _decoded(chunk: bytes, claimed: int) -> bytes:
-    """Return what a chunk holds: longer than it claims where it is, nothing where it is damaged."""
+    """Return the content of a chunk: longer than stated if it is, and nothing if it is damaged."""
     named = _CHUNK_HEAD.unpack_from(chunk)[4]
     name, rest = chunk[_CHUNK_HEAD.size :][:named], chunk[_CHUNK_HEAD.size + named :]
     data = rest[8:]
@@ -428,17 +427,17 @@ def _decoded(chunk: bytes, claimed: int) -> bytes:
             return bytes(optional("lz4.frame").LZ4FrameFile(BytesIO(data)).read(claimed + 1))
     except MissingExtraError:
         raise
-    except Exception:  # a damaged frame, which the reader refuses with an error of its own
+    except Exception:  # a damaged frame, for which the reader raises its own error
         return b""
     return data[:claimed]
 
 
 def _message_span(path: Path, decoded: bytes) -> tuple[int, ...]:
-    """Return the first and the last time of the messages among records, nothing without one."""
+    """Return the first and the last time of the messages among records, or nothing without a message."""
     at, times = 0, list[int]()
     while at + _RECORD.size <= len(decoded):
         kind, length = _RECORD.unpack_from(decoded, at)
-        if not kind:  # zeros are cheap to pack, and as records many to read
+        if not kind:  # zeros compress well, and would be read as very many records
             raise InputFileError(path, "expected records in a chunk, got zeros")
         at += _RECORD.size + length
         if kind == _MESSAGE and length >= _MESSAGE_HEAD.size and at <= len(decoded):

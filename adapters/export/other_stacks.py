@@ -1,6 +1,6 @@
-"""Entities as other stacks have them: Autoware's PredictedObjects, OSI's SensorData, ODAS's and MOT's tracks.
+"""Entities in the formats of other stacks: Autoware's objects, OSI's SensorData, tracks of ODAS and MOT.
 
-A place is as measured, or in the crossing lane where only the azimuth is known.
+A position is measured, or assumed in the crossing lane if only the azimuth is known.
 """
 
 import json
@@ -39,14 +39,14 @@ PATH_STEP_S, PATH_STEPS = 0.5, 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneObject:
-    """A moving entity as other stacks have it: with a position and a velocity."""
+    """A moving entity with a position and a velocity, which other stacks require."""
 
     entity: Entity
-    position_m: FloatArray  # x, y of the frame of the state
-    velocity_mps: FloatArray  # x, y over ground; zero where it is not known
-    covariance: FloatArray  # shape (2, 2): of the position, m^2
-    measured: bool  # Whether a sensor measured the position; else the lane is assumed
-    confidence: float  # Probability that it exists and goes along its path
+    position_m: FloatArray  # x, y in the frame of the state
+    velocity_mps: FloatArray  # x, y over ground; zero if unknown
+    covariance: FloatArray  # of the position, m^2, shape (2, 2)
+    measured: bool  # Whether a sensor measured the position; otherwise the lane is assumed
+    confidence: float  # Probability that it exists and follows its path
 
     @property
     def yaw_rad(self) -> float:
@@ -54,27 +54,27 @@ class LaneObject:
         return math.atan2(self.velocity_mps[1], self.velocity_mps[0])
 
     def path_m(self) -> FloatArray:
-        """Return where it is now and every half second until 3 s from now, shape (7, 2)."""
+        """Return its positions now and every 0.5 s until 3 s from now, shape (7, 2)."""
         after_s = PATH_STEP_S * np.arange(PATH_STEPS + 1)[:, None]
         return np.asarray(self.position_m + after_s * self.velocity_mps)
 
 
 def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[LaneObject]:
-    r"""Yield every moving entity at a place.
+    r"""Yield every moving entity with a position.
 
-    One of which only the azimuth is known is put in a lane across the road ahead,
+    An entity with an azimuth only is placed in a lane across the road ahead,
 
     .. math:: p = d\,(1, \tan\theta), \qquad
         \Sigma = \sigma_\theta^2\, \partial_\theta p\, \partial_\theta p^T + \sigma_d^2\, p p^T / d^2
 
-    and a hidden one comes towards the axis of the ego at the pace of its occluder, on each of its sides.
+    and a hidden one moves towards the axis of the ego at the pace of its occluder, on each possible side.
     """
     paces = {occluder.direction: occluder.pace_hz for occluder in state.context.occluders}
     coming = {cue.direction: (cue.within or {}).get("3") for cue in state.cues if cue.direction}
     moving = (part for one in state.entities if one.moving for part in one.on_each_side())
     for entity in moving:
         within = coming.get(entity.direction or "") if entity.status == "hidden" else None
-        # Existence times the chance that it comes, given that it exists: that product is what the cue states.
+        # Existence times P(it comes into view | it exists): the cue states this product.
         confidence = min(entity.existence_probability, 1.0 if within is None else within)
         if entity.position_m is None:
             pace_hz = paces.get(entity.direction or "", 0.0)
@@ -97,7 +97,7 @@ def _twist(state: WorldState) -> tuple[float, float]:
 
 
 def _of_axes(position_m: FloatArray, twist: tuple[float, float]) -> FloatArray:
-    """Return the velocity over ground of a place in the axes of the ego vehicle, which drives and turns."""
+    """Return the velocity over ground of a position that is fixed in the axes of the moving ego vehicle."""
     (x, y), (speed_mps, yaw_rate_rad_s) = position_m.tolist(), twist
     return np.array([speed_mps - yaw_rate_rad_s * y, yaw_rate_rad_s * x])
 
@@ -110,7 +110,7 @@ def _assumed(
     across = np.array([-along[1], along[0]])
     slope = max(along[0], math.cos(_WIDEST_RAD))
     position = crossing_m / slope * along
-    # On the circle only the azimuth moves it; in the lane the range changes with it.
+    # On the circle only the azimuth changes; in the lane the range changes with it.
     turned = crossing_m / slope * across if slope > along[0] else np.array([0.0, crossing_m / slope**2])
     spread = _CROSSING_SHARE * position
     covariance = entity.azimuth_std_rad**2 * np.outer(turned, turned) + np.outer(spread, spread)
@@ -119,13 +119,13 @@ def _assumed(
     else:
         velocity = (entity.azimuth_rate_rad_s or 0.0) * turned + _of_axes(position, twist)
         if not turned[0]:
-            # The lane stays where it is: a drive towards it changes the azimuth of what stands in it.
+            # The lane is fixed: driving towards it changes the azimuth of a standing vehicle in it.
             velocity = np.array([0.0, velocity[1] - velocity[0] * along[1] / along[0]])
     return LaneObject(entity, position, velocity, covariance, False, confidence)
 
 
 def _in_map(one: LaneObject, ego: Ego) -> LaneObject:
-    """Return an object in the map; its covariance gains that of the pose of the ego vehicle."""
+    """Return an object in the map, with the covariance of the ego pose added."""
     cos, sin = math.cos(ego.yaw_rad), math.sin(ego.yaw_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
     x, y = offset = turn @ one.position_m
@@ -135,9 +135,9 @@ def _in_map(one: LaneObject, ego: Ego) -> LaneObject:
     return replace(one, position_m=position, velocity_mps=velocity, covariance=covariance)
 
 
-# Of autoware_perception_msgs/ObjectClassification; a tram is none of them.
+# Numbers of autoware_perception_msgs/ObjectClassification, which has no tram.
 LABELS = {"unknown": 0, "car": 1, "van": 1, "truck": 2, "bus": 3, "motorcycle": 5, "bicycle": 6, "person": 7}
-# Length, width and height of a usual one, metres.
+# Usual length, width and height, metres.
 SIZES_M = {
     2: (8.0, 2.5, 3.2),
     3: (12.0, 2.5, 3.2),
@@ -146,17 +146,17 @@ SIZES_M = {
     7: (0.5, 0.5, 1.8),
 }
 CAR_M = (4.5, 1.8, 1.5)
-# Of what the message asks for and was not measured: "unknown" as Autoware's trackers state it.
+# Variance of required values without a measurement, as in Autoware's trackers.
 _UNKNOWN_VARIANCE = 1e4
 
 
 def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[str, Any]:
-    """Return the message, in the frame `map`; hidden entities stand in the occluded lane, see `lane_objects`.
+    """Return the message in the frame `map`; hidden entities are in the occluded lane, see `lane_objects`.
 
     Raises
     ------
     InvalidArgumentError
-        If no odometry with a pose has said where the ego vehicle is in the map.
+        If no odometry has given the pose of the ego vehicle in the map.
 
     Examples
     --------
@@ -176,7 +176,7 @@ def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[
 
 
 def is_localised(state: WorldState) -> bool:
-    """Return whether it is known where the ego vehicle is in the map."""
+    """Return whether the pose of the ego vehicle in the map is known."""
     return state.ego is not None and state.ego.localised
 
 
@@ -184,16 +184,16 @@ def is_localised(state: WorldState) -> bool:
 def autoware_lines(
     path: Path, crossing_m: float, opener: FileOpener, *, comes: bool
 ) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes the messages of states, one a line.
+    """Yield a function that writes the messages of states, one per line.
 
-    The first state must have a pose, unless one `comes` by a running odometry.
+    The first state must have a pose, unless it `comes` later from a running odometry.
     """
     started = comes
     with line_writer(path, opener) as write:
 
         def write_state(state: WorldState) -> None:
             nonlocal started
-            # After a fault of the clock the pose is unknown for a while, which does not end a run.
+            # After a clock fault the pose is unknown for a while; this must not end a run.
             if not started or is_localised(state):
                 write(json.dumps(autoware_objects(state, crossing_m), allow_nan=False))
             started = True
@@ -202,7 +202,7 @@ def autoware_lines(
 
 
 def likeliest_label(one: LaneObject) -> int:
-    """Return Autoware's number of the likeliest known class, 0 where none is known."""
+    """Return Autoware's number of the likeliest known class, or 0."""
     known = [said for said in one.entity.classification or () if LABELS.get(said.label, 0)]
     return LABELS[max(known, key=lambda said: said.probability).label] if known else 0
 
@@ -224,7 +224,7 @@ def _object(one: LaneObject) -> dict[str, Any]:
     return {
         "object_id": {"uuid": list(uuid.UUID(one.entity.id).bytes)},
         "existence_probability": one.entity.existence_probability,
-        # Planners take the first one, and fail where there is none.
+        # Planners use the first one, and fail without one.
         "classification": kinds,
         "kinematics": {
             "initial_pose_with_covariance": pose,
@@ -241,7 +241,7 @@ def _object(one: LaneObject) -> dict[str, Any]:
 
 
 def _kinds(entity: Entity) -> list[tuple[str, float]]:
-    """Return the classes with their probabilities, the likeliest first; what is left to one is unknown."""
+    """Return the classes with their probabilities, the likeliest first; the remainder to one is unknown."""
     told = [(said.label, said.probability) for said in entity.classification or ()]
     left = 1.0 - sum(probability for _, probability in told)
     return sorted(told + [("unknown", left)] * (left > 1e-6), key=lambda kind: -kind[1])
@@ -258,16 +258,16 @@ def _xyz(x: float, y: float, z: float = 0.0) -> dict[str, float]:
 
 
 def _covariance(of_xy: FloatArray) -> list[float]:
-    """Return the 6 x 6 of x, y, z and three angles, row by row; what is not known has a large variance."""
+    """Return the 6 x 6 covariance of x, y, z and three angles by rows; unknown variances are large."""
     whole = _UNKNOWN_VARIANCE * np.eye(6)
     whole[:2, :2] = of_xy
     return [float(value) for value in whole.ravel()]
 
 
-# Of osi3.MovingObject.VehicleClassification, by Autoware's numbers; a person has another type.
+# Numbers of osi3.MovingObject.VehicleClassification by those of Autoware; a person has another type.
 _VEHICLES = {1: "TYPE_CAR", 2: "TYPE_HEAVY_TRUCK", 3: "TYPE_BUS", 5: "TYPE_MOTORBIKE", 6: "TYPE_BICYCLE"}
 _PERSON = 7
-# Of the height of the middle, assumed: a van is .5 m higher than a car, and roads have a camber.
+# Assumed deviation of the height of the middle: a van is 0.5 m higher than a car, and roads have a camber.
 _Z_STD_M = 0.3
 
 
@@ -284,7 +284,7 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
     for stamp in (data.timestamp, data.last_measurement_time, data.moving_object_header.measurement_time):
         stamp.seconds, stamp.nanos = divmod(state.stamp_ns, 1_000_000_000)
     data.sensor_id.value = 1
-    # The axes of the state are those of the vehicle: a virtual sensor at their origin.
+    # The state is in the axes of the vehicle, so the virtual sensor is at their origin.
     _set(data.mounting_position.position, x=0.0, y=0.0, z=0.0)
     _set(data.mounting_position.orientation, yaw=0.0, pitch=0.0, roll=0.0)
     header = data.moving_object_header
@@ -298,16 +298,17 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
 
 
 def _set(part: Any, **values: float) -> None:
-    """Set all values of a part: a vector of OSI has three, or is not there."""
+    """Set all values of a part: a vector of OSI has three values or is absent."""
     for name, value in values.items():
         setattr(part, name, value)
 
 
 @contextmanager
 def osi_trace(path: Path, crossing_m: float, opener: FileOpener) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes states to a trace: of one channel, or multi-channel where it ends in .mcap.
+    """Yield a function that writes states to a trace, which is multi-channel if its name ends in .mcap.
 
-    The name of the latter is extended to OSI's convention at the end: the number of states is a part of it.
+    The name of a multi-channel trace is extended at the end to OSI's convention, which includes the number of
+    states.
     """
     check_extra("osi3")
     many, states = path.suffix.lower() == ".mcap", count()
@@ -321,7 +322,7 @@ def osi_trace(path: Path, crossing_m: float, opener: FileOpener) -> Iterator[Cal
 
 @contextmanager
 def _osi_lengths(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], None]]:
-    """Lend a function that writes a message after its length, little endian."""
+    """Yield a function that writes the length of a message, little endian, and then the message."""
 
     def write(data: Any, number: int) -> None:
         message = data.SerializeToString()
@@ -332,7 +333,7 @@ def _osi_lengths(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], 
 
 @contextmanager
 def _osi_mcap(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], None]]:
-    """Lend a function that writes a message to OSI's multi-channel trace."""
+    """Yield a function that writes a message to OSI's multi-channel trace."""
     osi, protobuf = _osi_versions()
     writer = optional("mcap.writer").Writer(file, chunk_size=1 << 12)  # a second of states
     writer.start()
@@ -375,7 +376,7 @@ def _osi_name(name: str, states: int) -> str:
 def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
     entity = one.entity
     header = moving.header
-    # OSI counts in 64 bits, of which the highest marks a value that is not set.
+    # OSI's ids have 64 bits, of which the highest marks an unset value.
     header.tracking_id.value = uuid.UUID(entity.id).int & (1 << 63) - 1
     header.existence_probability = entity.existence_probability
     header.age = seconds(entity.updated_ns - entity.created_ns)
@@ -402,25 +403,25 @@ def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
 
 
 class _Numbers:
-    """Numbers of entities as they come up, of what is there now: a long run has more than memory holds."""
+    """Numbers of the present entities in order of appearance; those of a whole run would fill the memory."""
 
     def __init__(self) -> None:
         self._there: dict[str, int] = {}
         self._next = count(1)
 
     def of(self, state: WorldState) -> dict[str, int]:
-        """Return the number of every entity of a state by its id; none is given again."""
+        """Return the number of every entity of a state by its id; no number is used twice."""
         self._there = {one.id: self._there.get(one.id) or next(self._next) for one in state.entities}
         return self._there
 
 
 @contextmanager
 def mot_lines(path: Path, opener: FileOpener) -> Iterator[Callable[[WorldState], None]]:
-    """Lend a function that writes states as text of MOTChallenge 2015, tracks in space.
+    """Yield a function that writes states as text of MOTChallenge 2015, tracks in space.
 
-    A line is ``frame, id, -1, -1, -1, -1, conf, x, y, z``: number of the state from 1, that of the entity,
-    its existence, and its place in metres in the frame of the state. A snapshot holds no box of an image, and
-    a moving entity of which no distance is stated has no line.
+    A line is ``frame, id, -1, -1, -1, -1, conf, x, y, z``: the number of the state from 1, the number of the
+    entity, its existence probability, and its position in metres in the frame of the state. A snapshot has no
+    boxes of images, and a moving entity without a known distance has no line.
     """
     numbers, frames = _Numbers(), count(1)
     with line_writer(path, opener) as write:
@@ -435,15 +436,15 @@ def mot_lines(path: Path, opener: FileOpener) -> Iterator[Callable[[WorldState],
         yield write_state
 
 
-# ODAS sends as many tracks each time, empty ones with id 0.
+# ODAS always sends the same number of tracks; empty ones have the id 0.
 _TRACKS = 4
-# ODAS Studio splits the stream at "}", newline, "{", and puts back the brace that is lost only where neither
-# of the two characters before the last is one: hence ODAS's own layout, in which "]" has a line of its own.
+# ODAS Studio splits the stream at "}", newline, "{". It restores the lost brace only if neither of the two
+# characters before the last one is a brace. Therefore the layout is ODAS's own, with "]" on a separate line.
 _ODAS_MESSAGE = '{{\n    "timeStamp": {stamp},\n    "src": [\n        {sources}\n    ]\n}}\n'
 
 
 class OdasTracks:
-    """Snapshots as ODAS's JSON of tracked sources; entities are numbered as they come up.
+    """Snapshots in ODAS's JSON of tracked sources; entities are numbered in order of appearance.
 
     Examples
     --------
@@ -455,7 +456,7 @@ class OdasTracks:
         self._numbers = _Numbers()
 
     def message(self, state: WorldState) -> str:
-        """Return one message: the likeliest moving entities as directions, existence as activity."""
+        """Return one message: the likeliest moving entities as directions, their existence as activity."""
         numbers = self._numbers.of(state)
         moving = [one for one in state.entities if one.moving]
         likeliest = sorted(moving, key=lambda one: -one.existence_probability)[:_TRACKS]
@@ -473,16 +474,16 @@ def _odas_track(entity: Entity, number: int) -> dict[str, object]:
 
 @contextmanager
 def odas_socket(address: str, *, live: bool = False) -> Iterator[Callable[[WorldState], None]]:
-    """Connect to HOST:PORT, as ODAS does, and lend a function that sends a state's message.
+    """Connect to HOST:PORT, as ODAS does, and yield a function that sends the message of a state.
 
-    A listener that is slow is waited for, and one that leaves is an error; not so in a `live` run, where a
-    `LiveSender` drops what is not taken.
+    The function waits for a slow receiver, and a receiver that disconnects is an error. In a `live` run a
+    `LiveSender` drops messages instead.
     """
     tracks, target = OdasTracks(), host_and_port("--export odas", address, 1)
     try:
         connection = socket.create_connection(target, TAKEN_S)
     except (OSError, TypeError, UnicodeError) as error:
-        # It has no file name, by which the command would name it.
+        # The message has no file name, so the command cannot add one.
         raise InvalidArgumentError(f"--export odas: expected a listener at {address} ({error})") from error
     if live:
         with LiveSender(target, connection) as sender:
@@ -493,26 +494,26 @@ def odas_socket(address: str, *, live: bool = False) -> Iterator[Callable[[World
 
 
 _LOG = logging.getLogger(__name__)
-# A listener that takes nothing for so long is disconnected; one that has gone is asked for as often as this.
+# A receiver that reads nothing for this time is disconnected; a new connection is tried at this interval.
 TAKEN_S, AGAIN_S = 10.0, 1.0
-# Two seconds of hops: older states are of no use.
+# Two seconds of hops: older states are useless.
 MOST_WAITING = 20
 
 
 class LiveSender:
-    """Send messages in a thread of its own, so that no listener holds a run up or ends it.
+    """Send messages in a separate thread, so that no receiver can delay or end a run.
 
     Parameters
     ----------
     target : (str, int)
-        Host and port to connect to again after the listener left.
+        Host and port of the receiver, for a new connection after it has disconnected.
     connection : socket
-        To it.
+        The open connection to it.
 
     Attributes
     ----------
     dropped : int
-        Messages that were not taken.
+        Number of dropped messages.
     """
 
     def __init__(self, target: tuple[str, int], connection: socket.socket) -> None:
@@ -522,7 +523,7 @@ class LiveSender:
         self._thread = threading.Thread(target=self._send, daemon=True)
 
     def put(self, message: bytes) -> None:
-        """Hand a message over; the oldest one makes room."""
+        """Queue a message; if the queue is full, it replaces the oldest one."""
         with self._changed:
             self.dropped += len(self._waiting) == MOST_WAITING
             self._waiting.append(message)
@@ -533,7 +534,7 @@ class LiveSender:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give what waits a second to be taken."""
+        """Wait up to one second until the queued messages are sent."""
         with self._changed:
             self._stopped.set()
             self._changed.notify()
@@ -551,7 +552,7 @@ class LiveSender:
                 message = self._waiting.popleft()
             try:
                 self._connection.sendall(message)
-            except OSError:  # the listener has gone, or has half a message
+            except OSError:  # the receiver has disconnected, or has half a message
                 self.dropped += 1
                 self._connection.close()
                 if self._stopped.wait(AGAIN_S):

@@ -1,4 +1,4 @@
-"""The world-state as a scene that Foxglove draws: its messages, and sectors, lines and labels in them."""
+"""The world-state as a scene for Foxglove: the messages, with sectors, lines and labels."""
 
 import base64
 import math
@@ -13,7 +13,7 @@ from worldstate.ground.serialisation import Check, Count, Probability
 from worldstate.ground.typing import FloatArray
 from worldstate.state import Entity, Occluder, RiskCue, SearchedView, WorldState
 
-# Primitives that are not drawn here; the message has a list of them all the same.
+# Unused primitives, for which the message must have an empty list.
 NoPrimitives: TypeAlias = Annotated[
     tuple[str, ...], Check("an empty list", lambda value: not value, {"maxItems": 0})
 ]
@@ -27,7 +27,7 @@ def _is_base64(text: str) -> bool:
     return True
 
 
-# In the words of JSON Schema; it is what tells a viewer to decode the text.
+# Keyword of JSON Schema by which a viewer decodes the text.
 Base64: TypeAlias = Annotated[str, Check("base64", _is_base64, {"contentEncoding": "base64"})]
 
 
@@ -222,14 +222,14 @@ class FrameTransform:
     rotation: Rotation
 
 
-# How far a sector is drawn. Sound gives no distance: the radius only tells the layers apart.
+# Radii of the sectors. Sound gives no distance: the radii only separate the layers.
 SECTOR_M, SEARCHED_M, CUE_M, SRP_M = 30.0, 15.0, 24.0, 12.0
-# Of the sectors that are drawn in one plane the later lie higher, or a viewer lets them flicker.
+# Later sectors are slightly higher: in one plane they would flicker in a viewer.
 _HEIGHT_M = {"occluder": 0.0, "searched": 0.02, "cue": 0.04, "entity": 0.06}
-# Triangles of a sector span at most this.
+# Largest angle of one triangle of a sector.
 _STEP_RAD = math.radians(5.0)
 _CAR = Xyz(4.5, 1.8, 1.5)
-# The palette of the figures, by meaning; grey is what hides. Decisions are lighter: viewers are dark.
+# The palette of the figures, by meaning; occluders are grey. Decisions are lighter, since viewers are dark.
 _GREY = (0.5, 0.5, 0.5)
 _HIDDEN = (0.835, 0.369, 0.0)
 _IN_VIEW = (0.0, 0.447, 0.698)
@@ -239,7 +239,7 @@ _HEARD = (0.8, 0.475, 0.655)
 
 
 def scene_update(state: WorldState) -> SceneUpdate:
-    """Return everything a snapshot says of places; what an earlier one drew is removed.
+    """Return the drawing of a snapshot; it removes the drawings of earlier ones.
 
     Examples
     --------
@@ -259,7 +259,7 @@ def scene_update(state: WorldState) -> SceneUpdate:
 def srp_scene(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> SceneUpdate:
     """Return the power of the sound over azimuth as a line about the array.
 
-    The radius is that of a circle, times the power over its median over azimuth.
+    Its radius is 12 m times the power over the median over azimuth.
     """
     level = srp / max(float(np.median(srp)), np.finfo(np.float64).tiny)
     radii = SRP_M * np.clip(level, 0.0, 2.0)
@@ -271,7 +271,7 @@ def srp_scene(state: WorldState, azimuths_rad: FloatArray, srp: FloatArray) -> S
 def sector_of(
     azimuth_rad: float, std_rad: float, sector_rad: tuple[float, float] | None
 ) -> tuple[float, float]:
-    """Return where something is in nine of ten cases: as stated, else by its standard deviation.
+    """Return the 90 % interval of an azimuth: as stated, otherwise by its standard deviation.
 
     Examples
     --------
@@ -284,7 +284,7 @@ def sector_of(
 
 
 def hidden_sector(occluder: Occluder) -> tuple[float, float]:
-    """Return where behind an occluder's edge a vehicle is in nine of ten cases, from right to left."""
+    """Return the 90 % interval of the azimuth of a vehicle behind an occluder, from right to left."""
     edge_rad, hidden_rad = occluder.edge_azimuth_rad, occluder.hidden_azimuth_rad
     far_rad = hidden_rad + math.copysign(NINE_OF_TEN * occluder.hidden_std_rad, hidden_rad - edge_rad)
     return min(edge_rad, far_rad), max(edge_rad, far_rad)
@@ -305,7 +305,7 @@ def label_of(entity: Entity) -> str:
 
 
 def _occluder(state: WorldState, occluder: Occluder) -> SceneItem:
-    """Draw the edge as a line and what lies behind it as a sector."""
+    """Draw the edge as a line and the hidden area as a sector."""
     near, far = (_at(occluder.edge_azimuth_rad, radius_m) for radius_m in (4.0, SECTOR_M))
     edge = SceneLine(0, (near, far), Rgba(*_GREY, 1.0))
     behind = _sector(hidden_sector(occluder), SECTOR_M, Rgba(*_GREY, 0.12), "occluder")
@@ -321,7 +321,7 @@ def _searched(state: WorldState, view: SearchedView) -> SceneItem:
 
 
 def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
-    """Draw the risk of a side, the denser the higher, and in words what comes within three seconds."""
+    """Draw the risk of a side as a density, with a label of the probability within 3 s."""
     sector_rad = sector_of(cue.azimuth_rad, cue.azimuth_std_rad, cue.sector_rad)
     raised = cue.advisory is not None
     color = Rgba(*(_DECISION if raised else _HIDDEN), 0.05 + 0.5 * (cue.risk or 0.0))
@@ -340,7 +340,7 @@ def _cue(state: WorldState, cue: RiskCue) -> SceneItem:
 
 
 def _entity(state: WorldState, entity: Entity) -> SceneItem:
-    """Draw where it is in nine of ten cases, and where it will be; a box only where a position is known."""
+    """Draw the 90 % interval of its azimuth and its forecast, and a box if its position is known."""
     color = _HIDDEN if entity.status == "hidden" else _IN_VIEW
     density = entity.existence_probability
     sector_rad = sector_of(entity.azimuth_rad, entity.azimuth_std_rad, entity.sector_rad)
@@ -366,13 +366,13 @@ def _entity(state: WorldState, entity: Entity) -> SceneItem:
 
 
 def _forecast(azimuth_rad: float, std_rad: float, color: tuple[float, float, float]) -> SceneLine:
-    """Draw an azimuth to come as an arc at the rim, as wide as nine of ten cases."""
+    """Draw a future azimuth as an arc at the rim, as wide as its 90 % interval."""
     arc = _azimuths(sector_of(azimuth_rad, std_rad, None))
     return SceneLine(0, tuple(_at(each, SECTOR_M) for each in arc), Rgba(*color, 0.6), thickness=0.4)
 
 
 def _item(state: WorldState, name: str, **shapes: tuple[object, ...]) -> SceneItem:
-    # After that nothing in the snapshot holds, and a viewer must not show it either.
+    # After this time the snapshot is not valid, and a viewer must not show it.
     lifetime_ns = 0 if state.valid_until_ns is None else max(state.valid_until_ns - state.stamp_ns, 1)
     stamp, lifetime = SceneTime.of_ns(state.stamp_ns), SceneTime.of_ns(lifetime_ns)
     return SceneItem(stamp, state.frame_id, name, lifetime, **shapes)  # type: ignore[arg-type]
@@ -386,7 +386,7 @@ def _sector(sector_rad: tuple[float, float], radius_m: float, color: Rgba, layer
 
 
 def _azimuths(sector_rad: tuple[float, float]) -> list[float]:
-    """Divide a sector, from the first azimuth to the left until the second."""
+    """Divide a sector from its right end to its left end."""
     first_rad, last_rad = sector_rad
     width_rad = (last_rad - first_rad) % (2.0 * math.pi) if last_rad < first_rad else last_rad - first_rad
     count = max(math.ceil(width_rad / _STEP_RAD), 1)

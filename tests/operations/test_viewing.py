@@ -54,6 +54,7 @@ def test_the_figure_over_time_names_its_panels(log, tmp_path):
     text = (tmp_path / "states.svg").read_text()
     for said in ("advisory left", "camera (tall: found)", "log-odds, left", "risk, right"):
         assert f"<!-- {said} -->" in text
+    assert "@media (prefers-color-scheme: dark)" in text
 
 
 def test_a_state_plots_itself_on_new_and_on_given_axes(states):

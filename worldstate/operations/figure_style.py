@@ -32,6 +32,8 @@ HEARD, TRUTH, DECISION = "#CC79A7", "black", "#332288"
 SIDE_DASHES = ("-", "--", "-.", ":")
 # Colours for everything else, such as methods and faults; any two differ by at least 22.
 CATEGORIES = ("#4D4D4D", "#E69F00", "#56B4E9", "#AA4499", "#997700", "#A6A6A6")
+# An SVG is dark on a dark page: lightness is inverted, hues stay.
+_DARK = " @media (prefers-color-scheme: dark) { svg { filter: invert(0.91) hue-rotate(180deg) } }"
 _STYLE = {
     "font.size": 10.0,
     "axes.titlesize": 10.0,
@@ -82,6 +84,9 @@ def figure_file(path: Path, width_in: float, height_in: float) -> Iterator["Figu
         yield figure
         with atomic_path(path) as temporary:
             figure.savefig(temporary, dpi=_DPI, format=path.suffix[1:].lower())
+            if path.suffix.lower() == ".svg":
+                text = Path(temporary).read_text("utf-8")
+                Path(temporary).write_text(text.replace("</style>", f"{_DARK}</style>", 1), "utf-8")
 
 
 def legend_beside(axes: "Axes", title: str | None = None) -> None:

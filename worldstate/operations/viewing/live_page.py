@@ -1,4 +1,4 @@
-"""A page on the loopback interface that shows a run while it goes on; a websocket brings it the hops."""
+"""A page on the loopback interface that shows a live run; a websocket delivers the hops."""
 
 import asyncio
 import json
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 HOST, STATES = "127.0.0.1", "/states"
-# A minute of hops: what a page that is opened later shows at once, and how far a slow one may fall behind.
+# One minute of hops: a page that is opened later shows them at once, and a slow page may be late by as much.
 MOST_ROWS = 600
 MOST_VIEWERS = 8
-# A viewer has so long for each: to ask, to answer a ping, and to close.
+# Longest time that a viewer may take for its request, for the reply to a ping, and for closing.
 _PATIENCE_S = 3.0
-# No viewer sends more than pings: of longer messages its connection ends.
+# Viewers send pings only: a longer message ends the connection.
 _MOST_BYTES = 1024
 
 
 class LivePage:
-    """Serves the page of a run, and to each that is open the hops as they come.
+    """Serve the page of a live run, and send each open page the hops as they arrive.
 
-    Only pages that it served itself, and programs of this machine, are given states: a browser lets any page
-    of the web ask a port of its machine, and names the page in the request.
+    Only its own pages and programs of this machine receive states. A browser lets any web page connect to a
+    port of the same machine, but its request contains the origin of the page.
 
     Parameters
     ----------
     port : int
-        On the loopback interface; 0 takes a free one.
+        Port on the loopback interface; 0 selects a free one.
 
     Attributes
     ----------
@@ -50,9 +50,9 @@ class LivePage:
     Raises
     ------
     InvalidArgumentError
-        If the port is none, or taken.
+        If the port is invalid or in use.
     MissingExtraError
-        Without the package websockets.
+        If the package websockets is not installed.
 
     Examples
     --------
@@ -90,12 +90,12 @@ class LivePage:
         self._loop.close()
 
     def show(self, live: LiveStep) -> None:
-        """Pass a hop on to every page that is open; no page holds it back."""
+        """Send a hop to every open page; a slow page does not delay it."""
         text = json.dumps(_live_row(live), allow_nan=False, separators=(",", ":"))
         asyncio.run_coroutine_threadsafe(self._take(text), self._loop)
 
     async def _take(self, row: str | None) -> None:
-        """Take a row, or None at the end of the run."""
+        """Store a row, or the end of the run (None), and wake all feeds."""
         async with self._changed:
             if row is None:
                 self._ended = True
@@ -115,7 +115,7 @@ class LivePage:
             compression=None,
             server_header=None,
             max_size=_MOST_BYTES,
-            # A connection that is refused is no event of the run.
+            # A refused connection is not reported as an event of the run.
             logger=logging.Logger("viewers", logging.CRITICAL),
             **times,
         ):
@@ -125,7 +125,7 @@ class LivePage:
                 await asyncio.wait(self._feeds, timeout=_PATIENCE_S)
 
     def _answer(self, viewer: "ServerConnection", request: "Request") -> "Response | None":
-        """Answer a request for the page; that of the websocket goes on."""
+        """Answer a request for the page; leave that of the websocket to the server."""
         if request.path == STATES:
             return None
         if request.path != "/":
@@ -136,7 +136,7 @@ class LivePage:
         return response
 
     async def _feed(self, viewer: "ServerConnection") -> None:
-        """Send a viewer all rows that it has not got, several as one message, until one of both ends."""
+        """Send a viewer all new rows, several as one message, until the viewer or the run ends."""
         task = asyncio.current_task()
         if task is None or len(self._feeds) >= MOST_VIEWERS:
             return
@@ -153,13 +153,13 @@ class LivePage:
                 async with asyncio.timeout(_PATIENCE_S):
                     await viewer.send(f"[{','.join(rows)}]")
         except TimeoutError:
-            viewer.transport.abort()  # a ping, and the handshake at the end, would wait for it as well
+            viewer.transport.abort()  # the closing handshake would wait for it as well
         finally:
             self._feeds.discard(task)
 
 
 def _live_row(live: LiveStep) -> Row:
-    """Return a hop as the page draws it: snapshot, boxes of each camera, health and delay."""
+    """Return the data of a hop for the page: snapshot, boxes of each camera, health and delay."""
     state = live.step.state
     late = {"latency_s": round(live.latency_s, 3), "overruns": live.overruns, "lost_s": round(live.lost_s, 2)}
     sensors = [[one.sensor, one.condition, one.reason] for one in state.sensors]

@@ -1,4 +1,4 @@
-"""A state log as one page of HTML to step through in a browser, without another file or a network."""
+"""A state log as one page of HTML, which needs no other file and no network."""
 
 import base64
 import io
@@ -25,48 +25,48 @@ from worldstate.operations.recordings.evidence_report import WHY_NOT, common_lin
 from worldstate.state import Entity, RiskCue, WorldState
 from worldstate.state.text import plain, towards
 
-# A snapshot with two entities is 1 kB: five to ten minutes are shown whole, and they take 6 MB at most.
+# A snapshot with two entities has 1 kB: five to ten minutes are shown completely, and take at most 6 MB.
 MOST_STATES = 3000
-# Of characters images take 12 MB at most and sound 8, so that a page stays below 27 MB. Of a street little is
-# heard above 8 kHz.
+# Images have at most 12 MB of characters and sound 8 MB, so that a page stays below 27 MB. Sound of a street
+# has little power above 8 kHz.
 MOST_IMAGES, MOST_CHARACTERS = 300, 12_000_000
 MOST_SOUND_S, HIGHEST_RATE_HZ, _MOST_RATE_HZ = 180.0, 16_000, 1_000_000
-# Images and sound stand in a log near the snapshots of their time.
+# A log contains images and sound within this time of the snapshots to which they belong.
 _WRITTEN_WITHIN_NS = 1_000_000_000
 # Half the sector in which a camera is searched for the source of a sound.
 _BESIDE_RAD = math.radians(10.0)
-# A street has fewer; of a fault that gives birth to many the likeliest are enough to see it.
+# A street has fewer entities; after a fault that creates many, the likeliest ones are enough to show it.
 _MOST_ENTITIES = 16
 
 Row: TypeAlias = dict[str, object]
 
 
 class PageData(TypedDict):
-    """What the page draws: azimuths in degrees, left positive, times in seconds on the states' clock."""
+    """Data of the page: azimuths in degrees, left positive, times in seconds on the clock of the states."""
 
     title: str
     remarks: list[str]
     t0_s: float | None
     truth: list[list[Row]]
     states: list[Row]
-    images: NotRequired[list[Row]]  # Time and data URI; "image" of a state is its number, -1 before the first
-    sound: NotRequired[str]  # Data URI, from the first snapshot on
+    images: NotRequired[list[Row]]  # Time and data URI; "image" of a state is an index, -1 before the first
+    sound: NotRequired[str]  # Data URI; the sound begins at the first snapshot
 
 
 def check_page(path: Path) -> Path:
-    """Return `path` if it names a page; commands call it before their work."""
+    """Return `path` if it ends in .html or .htm; commands call it before their work."""
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputFileError(path, "expected a page's name ending in .html")
     return path
 
 
 def write_log_page(path: Path, data: PageData) -> None:
-    """Write what `page_data` returns as one page of HTML, to exactly this file."""
+    """Write the result of `page_data` as one page of HTML to this file."""
     write_text(path, page_html(data))
 
 
 def page_html(data: PageData, live: str = "") -> str:
-    """Return the page; `live` is a script that may ask the server of the page for more, and nothing else."""
+    """Return the page; `live` is a script that may connect to the server of the page only."""
     template = (files("worldstate") / "data" / "log_view.html").read_text("utf-8")
     # Within a script element only "<" can end it or begin a comment.
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
@@ -82,27 +82,26 @@ def page_data(
     truth: Sequence[TrueTrack] = (),
     media: Iterable[tuple[int, CompressedImage | RawAudio]] = (),
 ) -> PageData:
-    """Return what the page draws of snapshots.
+    """Return the data of the page from snapshots.
 
     Parameters
     ----------
     states : iterable of WorldState
-        Of one run, at least one; of more than 6,000 every second, fourth, ... is kept.
+        Snapshots of one run, at least one; beyond 6,000 only every second, fourth, ... is kept.
     title : str
         Heading of the page.
     t0_s : float, optional
-        Line-of-sight entry.
+        Time of line-of-sight entry, s.
     truth : sequence of TrueTrack
         True tracks of the vehicles of a simulated recording.
     media : iterable of (int, CompressedImage or RawAudio), optional
-        What `read_media` yields of the log: read after the snapshots, images and sound each in order of their
-        stamps, ns. The page holds at most 300 images of 12 MB, thinned evenly, and 180 s of sound at no more
-        than 16 kHz.
+        Images and sound from `read_media`, each in order of their stamps, ns; read after the snapshots. The
+        page holds at most 300 images with 12 MB, evenly spread, and 180 s of sound at no more than 16 kHz.
 
     Raises
     ------
     InvalidArgumentError
-        If there is no snapshot, or the sound is not of one microphone at one rate.
+        If there is no snapshot, or if the sound is not of one microphone at one rate.
 
     Examples
     --------
@@ -149,7 +148,7 @@ def _add_media(
 
 @dataclass(slots=True)
 class _Images:
-    """Images from the last before the first snapshot on, thinned evenly to what a page holds."""
+    """Images since the last one before the first snapshot, thinned evenly to the limit of a page."""
 
     first_ns: int
     last_ns: int
@@ -169,7 +168,7 @@ class _Images:
             self.kept, self.every = self.kept[::2] if len(self.kept) > 1 else [], 2 * self.every
 
     def add_to(self, data: PageData, stamps_ns: Sequence[int]) -> None:
-        """Add the images, and to each snapshot the number of its own."""
+        """Add the images, and to each snapshot the index of its image."""
         kept = self.kept
         if len(kept) < self.count:
             said = f"{len(kept)} of {self.count} images of the camera are shown, evenly spread over the time."
@@ -182,7 +181,7 @@ class _Images:
 
 @dataclass(slots=True)
 class _Sound:
-    """Sound from the first snapshot on; where the log has none in between, it is silent."""
+    """Sound since the first snapshot, with silence for gaps in the log."""
 
     first_ns: int
     last_ns: int
@@ -192,7 +191,7 @@ class _Sound:
 
     @property
     def span_s(self) -> float:
-        """How much of it a page holds."""
+        """Length of the sound of the page, s."""
         return min(seconds(self.last_ns - self.first_ns), MOST_SOUND_S)
 
     def take(self, stamp_ns: int, block: RawAudio) -> None:
@@ -207,7 +206,7 @@ class _Sound:
             self.samples = np.zeros(round(self.span_s * rate), np.int16)
         told = base64.b64decode(block.data)
         heard = np.frombuffer(told, "<i2", len(told) // 2)
-        # The blocks after the first are placed by whole samples from it: rounding leaves no gap.
+        # Later blocks are placed at whole samples from the first one, so that rounding leaves no gap.
         begun = round(seconds(self.begun_ns - self.first_ns) * rate)
         at = begun + round(seconds(stamp_ns - self.begun_ns) * rate)
         low, high = np.clip((at, at + len(heard)), 0, len(self.samples))
@@ -218,7 +217,7 @@ class _Sound:
             return
         samples, step = self.samples, -(-self.rate_hz // HIGHEST_RATE_HZ)
         if step > 1:
-            from scipy import signal  # a second of importing, which a page without sound does not need
+            from scipy import signal  # Imported here: it takes 1 s, and a page without sound needs none
 
             resampled = signal.resample_poly(samples.astype(float), 1, step)
             samples = np.clip(np.rint(resampled), -32768, 32767).astype(np.int16)
@@ -231,10 +230,10 @@ class _Sound:
 
 
 def _remarks(count: int, every: int, calibrated: int) -> list[str]:
-    """Say what a reader of the page must not take for more than it is."""
+    """Return the limitations of the page, for its reader."""
     said = []
     if not calibrated:
-        said.append("Not calibrated: no snapshot holds to a budget of false alarms. No threshold is drawn.")
+        said.append("Not calibrated: no snapshot keeps a budget of false alarms. No threshold is drawn.")
     elif calibrated < count:
         said.append(
             f"{count - calibrated} of {count} snapshots are not calibrated: nothing could be heard, or the "
@@ -242,8 +241,8 @@ def _remarks(count: int, every: int, calibrated: int) -> list[str]:
         )
     if every > 1:
         said.append(
-            f"One of {every} snapshots is shown of {count}: what was shorter may be missing. "
-            "The option --between shows every one of a part."
+            f"One of {every} snapshots is shown of {count}: shorter events may be missing. "
+            "The option --between shows every snapshot of a part."
         )
     return said
 
@@ -297,7 +296,7 @@ def is_reflected(state: WorldState) -> bool:
 
 
 def page_row(state: WorldState) -> Row:
-    """Return one snapshot as the page draws it, rounded to what can be seen there."""
+    """Return the data of one snapshot for the page, rounded to the resolution of the drawing."""
     parts = (part for one in state.entities if one.moving for part in one.on_each_side())
     likeliest = sorted(parts, key=lambda one: -one.existence_probability)[:_MOST_ENTITIES]
     bearing = state.bearing
@@ -342,8 +341,9 @@ def _entity(one: Entity) -> Row:
 
 
 def _cue(one: RiskCue) -> Row:
-    within, evidence = one.within or {}, one.evidence
-    held = one.held and f"held until {seconds(one.held.until_ns):.1f} s: now below the threshold"
+    within, evidence, held = one.within or {}, one.evidence, None
+    if one.held is not None:
+        held = f"below the threshold, ends at the latest at {seconds(one.held.until_ns):.1f} s"
     return {
         "side": one.direction,
         "risk": None if one.risk is None else round(one.risk, 5),
@@ -370,11 +370,11 @@ def _track(true: TrueTrack) -> list[Row]:
 
 
 def sector(sector_rad: tuple[float, float]) -> Row:
-    """Return the ends of a sector as the page draws them."""
+    """Return the ends of a sector in degrees."""
     low, high = map(degrees, sector_rad)
     return {"low": low, "high": high}
 
 
 def degrees(azimuth_rad: float) -> float:
-    """Return an azimuth as the page draws it."""
+    """Return an azimuth in degrees, rounded for the page."""
     return round(math.degrees(azimuth_rad), 1)

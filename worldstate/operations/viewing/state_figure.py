@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _WINDOW_S = WINDOW_HOPS / HOP_RATE_HZ
-# Longest title in one line above a figure of this width.
+# Longest title that fits on one line above a figure of this width.
 _TITLE_CHARACTERS = 100
 # No threshold is below this (odds of one to a thousand); the first windows of a run reach -20.
 _LOWEST_NATS = -7.0
@@ -44,8 +44,8 @@ _LEGEND = (
     ("hidden vehicle and its risk", style.HIDDEN, 0.4),
     ("vehicle in view", style.IN_VIEW, 0.35),
     ("advisory", style.DECISION, 1.0),
-    ("searched, nothing found", style.SEARCHED, _NOTHING),
-    ("searched, found", style.SEARCHED, _FOUND),
+    ("searched, no vehicle", style.SEARCHED, _NOTHING),
+    ("searched, vehicle found", style.SEARCHED, _FOUND),
     ("behind an occluder", "0.5", 0.2),
 )
 
@@ -152,7 +152,7 @@ def write_state_figure(
             entry.set_label("line-of-sight entry $T_0$" if axes is azimuths else "")
         for axes in (azimuths, decision, probabilities):
             style.legend_beside(axes)
-        # The first window begins a second before its decision.
+        # The first window begins 1 s before its decision.
         span_s = _times(states)[0] - _WINDOW_S, _times(states)[-1] + style.HOP_S
         probabilities.set(xlabel="time (s), end of the decision window", xlim=span_s)
         shown = title if len(title) <= _TITLE_CHARACTERS else "..." + title[-_TITLE_CHARACTERS:]
@@ -379,7 +379,7 @@ def _wedge(
 ) -> None:
     from matplotlib.patches import Wedge
 
-    # Ahead is up: matplotlib's angles begin at the right, and turn to the left too.
+    # Ahead is up: matplotlib's angles begin on the right and are left positive as well.
     first, last = (math.degrees(azimuth) + 90.0 for azimuth in sector_rad)
     drawn = {"color": color, "alpha": min(alpha, 1.0), "lw": 0, **drawn}
     axes.add_patch(Wedge((0.0, 0.0), radius_m, first, last, **drawn))
