@@ -126,7 +126,7 @@ def camera_images(recording: Path, start_ns: int = 0) -> Callable[[int], Iterato
 def recorded_sound(
     sound: SoundInput, start_ns: int = 0, channels: Sequence[int] = ()
 ) -> Iterator[Callable[[int], Iterator[LogMessage]]]:
-    """Yield a function that yields the sound of one microphone of a file up to increasing stamps."""
+    """Yield a function that returns the sound of one microphone of a file up to increasing stamps."""
     if not isinstance(sound, Path | tuple):
         yield lambda stamp_ns: iter(())
         return

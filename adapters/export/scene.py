@@ -184,7 +184,7 @@ class SceneRemoval:
 
 @dataclass(frozen=True, slots=True)
 class SceneUpdate:
-    """What appears in a scene and what goes, as `foxglove.SceneUpdate`."""
+    """Additions and removals of a scene, as `foxglove.SceneUpdate`."""
 
     deletions: tuple[SceneRemoval, ...]
     entities: tuple[SceneItem, ...]
@@ -202,7 +202,7 @@ class CompressedImage:
 
 @dataclass(frozen=True, slots=True)
 class RawAudio:
-    """A block of sound of one microphone, 16 bits a sample, as `foxglove.RawAudio`."""
+    """A block of sound of one microphone, 16 bits per sample, as `foxglove.RawAudio`."""
 
     timestamp: SceneTime
     data: Base64
@@ -213,7 +213,7 @@ class RawAudio:
 
 @dataclass(frozen=True, slots=True)
 class FrameTransform:
-    """Where a frame is in another one, as `foxglove.FrameTransform`."""
+    """Pose of a frame in another frame, as `foxglove.FrameTransform`."""
 
     timestamp: SceneTime
     parent_frame_id: str

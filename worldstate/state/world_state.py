@@ -229,7 +229,7 @@ class WorldState:
         SchemaVersionError
             On another schema or another major version.
         InvalidArgumentError
-            If a value is missing, of the wrong type or out of range; the message has its place.
+            If a value is missing, of the wrong type or out of range; the message contains its path.
         """
         return _upgraded(value) if is_former(value) else decode(cls, value, "snapshot")
 
