@@ -1,4 +1,4 @@
-"""Boxes of the simulated detector: they begin at line of sight and have small errors."""
+"""Simulated detector: boxes of vehicles in line of sight, with small errors and misses."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -89,7 +89,7 @@ def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generato
 def through_rain(
     frames: Sequence[Frame], showers: Iterable[tuple[float, float, float]], rng: np.random.Generator
 ) -> list[Frame]:
-    """Remove the boxes that drops on the lens hide in showers, given by begin, end and share."""
+    """Remove boxes that drops on the lens hide; a shower is (start, end, share of lost boxes)."""
     missed, time = np.zeros(len(frames)), np.arange(len(frames)) / FRAME_RATE_HZ
     for begin_s, end_s, share in showers:
         # The lens is dry when the rain ends; drying is not modelled.

@@ -13,7 +13,7 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageA
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M
 
-# From two coordinates on a surface to red, green, blue in 0..255, shape (..., 3).
+# Maps two coordinates on a surface to red, green, blue in 0..255, shape (..., 3).
 Paint = Callable[[Float32Array, Float32Array], Float32Array]
 
 OVERSAMPLING = 2  # Rays per pixel in each direction
@@ -104,10 +104,10 @@ class Panel:
     """A painted rectangle perpendicular to one axis."""
 
     axis: int  # The constant coordinate: 0, 1 or 2
-    at_m: float  # Its value
+    at_m: float  # Value of that coordinate
     # Ranges of the other two coordinates, in the order of the axes.
     limits_m: tuple[tuple[float, float], tuple[float, float]]
-    paint: Paint  # Colour by those two coordinates
+    paint: Paint  # Colour as a function of those two coordinates
 
 
 def cast_panels(
@@ -220,7 +220,7 @@ def asphalt(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
 
 
 def paving(a: Float32Array, b: Float32Array, seed: int) -> Float32Array:
-    """Paint paving bricks in courses, brown grey."""
+    """Paint brown-grey paving bricks in courses."""
     return tinted((124.0, 108.0, 98.0), _courses(a, b, 0.2, 0.1, seed))
 
 
@@ -248,7 +248,7 @@ def brick(a: Float32Array, b: Float32Array, colour: Colour, seed: int) -> Float3
 
 
 def _courses(a: Float32Array, b: Float32Array, length_m: float, height_m: float, seed: int) -> Float32Array:
-    """Return the shade of stones in courses, shifted by half a stone in turn, with dark joints."""
+    """Return the shade of stones with dark joints; every other course is shifted by half a stone."""
     course = np.floor(b / np.float32(height_m))
     along = a / np.float32(length_m) + 0.5 * np.mod(course, 2.0)
     shade = 0.85 + 0.3 * cell_noise(along, course, seed)
@@ -290,7 +290,7 @@ class Facade:
 
 @dataclass(frozen=True, slots=True)
 class _Opening:
-    """Half width of an opening in a wall, its start, the height of its sill, and its filling."""
+    """An opening in a wall: half width, lower edge, height of the sill, and colour."""
 
     half_m: float
     low_m: float
@@ -304,7 +304,7 @@ DOOR = _Opening(0.45, 0.0, 0.0, (70.0, 82.0, 78.0))
 
 ROAD_Z_M = -ARRAY_HEIGHT_M
 FAR_M = 150.0
-# The corner of a building projects from its side wall on the last metre.
+# A building projects from its side wall over the last metre before the corner.
 PIER_M = 1.0
 PAVEMENT_M = 0.9
 # Sites without a wall opposite have a verge with a hedge and houses behind.
@@ -328,7 +328,8 @@ class StreetView:
         return np.concatenate([reduced(self.image[row : row + step].astype(np.float32)) for row in rows])
 
 
-# Painting takes 4 s, a third of a recording's video. Five sites of 66 MB each: those of OVAD.
+# Painting takes 4 s, a third of the time of a recording's video. The cache holds OVAD's five sites, 66 MB
+# each.
 @lru_cache(maxsize=5)
 def paint_street(site: Site, view: View) -> StreetView:
     """Paint a site; it is the same in every recording."""
@@ -360,7 +361,7 @@ def street_panels(site: Site) -> list[Panel]:
 
 
 def _building(site: Site, side: float, front: Facade, height_m: float) -> list[Panel]:
-    """Return side wall, return of the corner pier, and the pier itself; side is +1 left, -1 right."""
+    """Return the side wall, and front and side of the pier at its corner; `side` is +1 left, -1 right."""
     wall = site.side_wall_left_m if side > 0 else site.side_wall_right_m
     corner = site.corner_left_m if side > 0 else site.corner_right_m
     start, end = site.corner_ahead_m - PIER_M, site.corner_ahead_m

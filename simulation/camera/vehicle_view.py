@@ -83,7 +83,7 @@ def add_car(street: StreetView, car: Car, image: Float32Array) -> None:
 
 def with_parked_car(street: StreetView, car: Car) -> StreetView:
     """Return the street with a parked car."""
-    # It hides no moving vehicle: in narrow streets parked cars extend into the lanes.
+    # A parked car hides no moving vehicle here, because in narrow streets parked cars extend into the lanes.
     patch = street.view.around(car.corners_m())
     if patch is None:
         return street
@@ -112,7 +112,6 @@ def _painted(street: StreetView, car: Car, patch: Patch) -> Float32Array:
 
 
 def _cast_shadow(colours: Float32Array, depth: Float32Array, rays: Float32Array, eye: FloatArray) -> None:
-    """Darken the road under and beside the car."""
     with np.errstate(divide="ignore"):
         road = np.float32(-eye[2]) / rays[..., 2]
     across = eye[0] + road * rays[..., 0]

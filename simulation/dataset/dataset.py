@@ -59,7 +59,7 @@ APPROACH_SIDES = ("left", "right")
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Properties of the recording `number` of a data set, before anything is drawn."""
+    """Properties of one recording of a data set, fixed before anything is drawn at random."""
 
     number: int
     environment: str
@@ -80,8 +80,8 @@ class DatasetSettings:
     seed : int
         Seed of the whole data set.
     scene : str
-        "junction"; one of `PLACES`, where the ego stands and a vehicle comes from the sides of the place; or
-        "all" for the junctions and every place in turn.
+        "junction"; one of `PLACES`, with a standing ego and vehicles from the sides of the place; or "all"
+        for the junctions and every place in turn.
     kind : str
         Kind of the vehicles, one of `KINDS`.
     duration_s : float
@@ -92,11 +92,11 @@ class DatasetSettings:
     video_width_px : int
         Width of the images, 64 to 1936 (OVAD's); the height follows. Boxes refer to the full size.
     bandwidth_hz : float, optional
-        Upper limit of the rendered band, 700 to 16,000 Hz, at the rate `rate_for`; the full rate by default.
+        Upper limit of the rendered band, 700 to 16,000 Hz; `rate_for` gives the rate. Full by default.
     sounds : tuple of str
-        Further sounds in every recording, from `SOUNDS`; a vehicle's signal belongs to the vehicle, if any.
+        Further sounds in every recording, from `SOUNDS`; a vehicle's signal is added to the vehicle, if any.
     preset : str
-        Name of the levels and spectra of everything that is not geometry.
+        Name of the preset: levels and spectra of everything except the geometry.
     sounds_folder : str
         Folder of recordings, one folder per kind of sound, that replace synthesis; none if empty.
 
@@ -225,8 +225,8 @@ def write_dataset(
 ) -> list[LogRow]:
     """Simulate a data set.
 
-    The same settings give the same bytes for any number of jobs, because every recording has its own seed. An
-    interrupted call leaves the recordings that were finished in order, and the log that lists them.
+    The same settings give the same bytes for any number of jobs, because every recording has its own seed.
+    After an interrupted call, the recordings that were finished in order and a log of them remain.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def write_dataset(
     jobs : int
         Processes, 1 to 256.
     progress : callable, optional
-        Called with every recording in order, once it is finished or found.
+        Called with every recording in order, when it is finished or found.
     go_on : bool
         Whether to keep listed recordings of these settings and continue an interrupted call.
 
@@ -392,7 +392,7 @@ def _simulate_one(
         if isinstance(truth, dict) and truth.get("settings") == json.loads(json.dumps(asdict(settings))):
             return None
     recording = simulate_recording(settings, rng, array)
-    # The images have their own generator, so that the rest does not change with video.
+    # The images have their own generator, so that the option `video` does not change the rest.
     frames = None
     if wanted.video:
         frames = camera_frames(settings, recording, rng.spawn(1)[0], wanted.camera())
@@ -424,7 +424,7 @@ def _listed(root: Path) -> dict[Path, LogRow]:
 
 CODEC = "mp4v"
 SENSOR_NOISE = 1.5  # Grey levels
-# Ten standard deviations of a parked car's box; a moving vehicle moves further in a frame.
+# Ten standard deviations of a parked car's box; a moving vehicle moves further between two images.
 STILL_PX = 4.0
 STEP_M = 0.01
 
@@ -447,9 +447,9 @@ def camera_frames(
     >>> len(frames), frames[0].shape, frames[0].dtype
     (6, (60, 96, 3), dtype('uint8'))
     """
-    # The street depends on the site; buildings hide the vehicle until its front passes the line of sight at
-    # their corner, which is the recording's T0. Light is constant and the camera stands, so that the images
-    # change by the vehicle, its shadow and the sensor's noise only.
+    # The street depends on the site alone. Buildings hide the vehicle until its front crosses the line of
+    # sight past their corner, which is the recording's T0. Light and camera do not change, so two images
+    # differ only in the vehicle, its shadow and the sensor noise.
     view = View(camera or PinholeCamera.ovad())
     paint, parked_paint = (PAINTS[i] for i in rng.integers(len(PAINTS), size=2))
     street = paint_street(settings.site, view)
@@ -513,8 +513,8 @@ def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
 
 
 def _columns_px(camera: PinholeCamera, ahead_m: FloatArray, ends_m: FloatArray) -> FloatArray:
-    """Return the first and last column of cuboids whose faces (2,) end at (n, 2, 2), shape (n, 2)."""
-    # At the camera's own height, where the pitch only shortens the depth.
+    """Return the first and last column of n cuboids, (n, 2), from two faces (2,) and their ends (n, 2, 2)."""
+    # At the height of the camera, its pitch only shortens the depth.
     slope = (ends_m - camera.position_m[1]) / ((ahead_m - camera.position_m[0]) * np.cos(camera.pitch_rad))
     focal = 0.5 * camera.width_px / np.tan(camera.half_angle_rad)
     columns = np.clip(0.5 * camera.width_px - focal * slope, 0.0, camera.width_px - 1.0).reshape(-1, 4)

@@ -37,9 +37,10 @@ def describe(
     # Keys of a frame: `position_m` (front bumper, x ahead and y left of the array), `speed_mps`,
     # `azimuth_rad` (of the front axle, left positive), `range_m`, `line_of_sight` (whether the front is in
     # view: between the edges of the image and not hidden), `time_to_visible_s` (negative afterwards, null if
-    # it never comes into view). `frames` are those of the vehicle of `approach`, `others` those of the rest.
-    # Without the former there are no frames and `entry_s` is null. `ego` has the ego's position along its
-    # street, 0 at its stop. `sounds` has the azimuth, range and time of other placed sounds.
+    # it never comes into view). `frames` belongs to the vehicle of `approach`, `others` to the other
+    # vehicles. Without a vehicle of `approach`, `frames` is empty and `entry_s` is null. `ego` contains the
+    # ego's position along its street, 0 at its stop. `sounds` contains the azimuth, range and time of other
+    # placed sounds.
     ego_x = settings.ego.x_m(frames_s)
     entries = [comes_into_view_s(settings, vehicle) for vehicle in settings.traffic]
     frames = [_frames(*one, ego_x) for one in zip(seen, sights, entries, strict=True)]
@@ -132,15 +133,15 @@ def refuse_foreign(target: Path) -> None:
 
 
 def put_in_place(target: Path, finished: Path) -> None:
-    """Move a finished folder to its place; an old folder is removed with the parent of the new one."""
+    """Move a finished folder to its place, and an old folder there to the temporary parent of the new one."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.exists():
         target.replace(finished.with_suffix(".old"))
     finished.replace(target)
 
 
-FULL_SCALE_PA = 20.0  # 120 dB, the upper limit of such measurement microphones
-HEAD_START_S = 2.0  # Emission begins this long before the recording: travel time and late field
+FULL_SCALE_PA = 20.0  # 120 dB, the upper limit of measurement microphones
+HEAD_START_S = 2.0  # Emission starts this long before the recording, to cover travel time and late field
 SAMPLES_AT_ONCE = 1024
 NO_VEHICLE_T0 = 0.7  # OVAD assigns frame 70 of 100 to recordings without a vehicle
 
@@ -156,12 +157,13 @@ class SimulatedRecording:
     sample_rate_hz : float
         Rate of `audio`.
     t0_frame : int
-        First camera frame with line of sight, at 10 frames per second; 70 % of the length without a vehicle.
+        First camera frame with line of sight, at 10 frames per second; without a vehicle at 70 %
+        of the length.
     detections : tuple of tuple of SimulatedDetection
         One tuple per camera frame; no frames for a moving ego, for which OVAD has no detections: vision is
         unqueried there.
     truth : dict
-        Settings, trajectory, line of sight and azimuth per frame; see `truth.describe`.
+        Settings, trajectory, line of sight and azimuth per frame; see `describe`.
     array : MicrophoneArray
         The array, in the order of the channels.
 
@@ -187,9 +189,9 @@ def simulate_recording(
 ) -> SimulatedRecording:
     """Simulate one recording.
 
-    The sound of the vehicle reaches every microphone by mirror images in the walls of both streets, straight
-    or diffracted at a corner, each with its own travel time, above the ambient field of the site. All levels
-    are absolute, so that the signal-to-noise ratio is lower while the vehicle is hidden.
+    Every microphone receives the vehicle's sound by mirror images in the walls of both streets. Each path is
+    straight or diffracted at a corner and has its own travel time. The ambient field of the site is added.
+    All levels are absolute, so the signal-to-noise ratio is lower while the vehicle is hidden.
 
     Parameters
     ----------
@@ -198,11 +200,7 @@ def simulate_recording(
     rng : numpy.random.Generator
         Source of randomness; the same state gives the same recording.
     array : MicrophoneArray, optional
-        Default `ovad_array`. Its centre is 1.7 m above the road, whatever heights its positions have.
-
-    Returns
-    -------
-    SimulatedRecording
+        Default `ovad_array`. Its centre is placed 1.7 m above the road.
 
     Raises
     ------
@@ -250,7 +248,7 @@ def _record(settings: SimulationSettings, array: MicrophoneArray, rng: np.random
     street = StreetSound(static, settings.site, settings.preset, receiver)
     for path, draws in zip(paths, to_emission.spawn(len(paths)), strict=True):
         add_vehicle(street, path, draws)
-    # Separate generators, used only if there is a sound, so that the rest does not change.
+    # Sounds have generators of their own, so that a sound does not change the rest of the recording.
     for path, vehicle in zip(paths, settings.traffic, strict=True):
         if vehicle.signal:
             add_signal(street, vehicle.signal, path, rng.spawn(1)[0])

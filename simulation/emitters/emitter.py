@@ -22,7 +22,7 @@ from .signals import gate
 
 Synthesis = Callable[[int, float, np.random.Generator], FloatArray]
 
-# By the names of `SOUNDS`.
+# Keys are the names of `SOUNDS`.
 SYNTHESES: dict[str, Synthesis] = {
     one.__name__.replace("_", "-"): one
     for one in (
@@ -33,21 +33,23 @@ SYNTHESES: dict[str, Synthesis] = {
         *(syntheses.bicycle_bell, syntheses.jackhammer),
     )
 }
-# Everything is synthesised at an integer multiple of the requested rate, at least this one, and then
-# band-limited: partials above a low Nyquist frequency do not alias, and the level is that of the whole sound.
+# Sounds are synthesised at an integer multiple of the requested rate, which is at least this rate, and then
+# band-limited. So partials above a low Nyquist frequency do not alias, and the level is that of the full
+# band.
 LOWEST_RATE_HZ = 24_000.0
-# A shorter piece is cut out of this length, because a pause between two words must not become a shout
+# A shorter piece is cut out of a sound of this length. If its own level were set, a pause between two words
+# would become as loud as a shout.
 LEVEL_FROM_S = 6.0
 EDGE_S = 0.01
-TRANSITION = 0.05  # Share of the Nyquist frequency below it
+TRANSITION = 0.05  # Width of the low-pass transition, as a share of the Nyquist frequency
 BLOCK_S, LOUD_DB = 0.125, 10.0
 
 
 SUFFIXES, MOST_FILES = (".wav", ".flac"), 10_000
-# Length that is read of a recording, and to which its level refers: a silent stretch between two barks must
-# not become as loud as a bark.
+# Length of a recording that is read and over which its level is measured, so that a silent stretch between
+# two barks does not become as loud as a bark.
 READ_S = 60.0
-FINEST = 1000  # Denominator of the ratio of two rates: the error is below a millionth
+FINEST = 1000  # Largest denominator of the ratio of two rates: the error is below a millionth
 
 
 def emitted(
@@ -130,14 +132,14 @@ def a_weighted(signal: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def loud_pressure(signal: FloatArray, rate_hz: float) -> float:
-    """Return the RMS over the eighths of a second within 10 dB of the loudest."""
+    """Return the RMS over all blocks of 1/8 s whose level is within 10 dB of the loudest block."""
     block = min(int(BLOCK_S * rate_hz), len(signal))
     power = np.square(signal[: len(signal) // block * block]).reshape(-1, block).mean(axis=1)
     return float(np.sqrt(power[power >= power.max() * 10.0 ** (-LOUD_DB / 10.0)].mean()))
 
 
 def _band_limited(signal: FloatArray, factor: int) -> FloatArray:
-    """Return every `factor`-th sample of the signal below the remaining Nyquist frequency."""
+    """Remove frequencies above the new Nyquist frequency and return every `factor`-th sample."""
     if factor == 1:
         return signal
     n = len(signal)

@@ -21,8 +21,8 @@ from worldstate.simulation.sound.static_field import PlacedSource, StreetSound, 
 from .emitter import emitted
 from .weather import add_gusts, add_rain, add_wind
 
-# From this reflection order on, a vehicle is one point; its parts would cost three times as much. Order 2 is
-# too low: whether the second image on the vehicle's own side is lit depends on a metre.
+# From this reflection order on, a vehicle is one point, because its parts would cost three times as much.
+# Order 2 is too low: a shift of one metre decides whether the second image on the vehicle's own side is lit.
 POINT_REFLECTIONS = 3
 BASS_BELOW_HZ = 177.0  # Between the octaves of 125 and 250 Hz
 
@@ -64,11 +64,12 @@ def engine_bass_db(preset: Preset) -> FloatArray:
     return np.where(OCTAVES_HZ < BASS_BELOW_HZ, preset.engine_bass_db, 0.0)[:, None]
 
 
-# Silence before and after: the octave bands of a sudden sound begin a little earlier than the sound.
+# Blocks of silence before and after a sound, because the octave bands of a sudden sound begin a little
+# earlier than the sound.
 SILENT_BLOCKS = 8
-# Levels of the table are free-field levels; those of a source in `air.ground_gain` include hard ground.
+# Levels of the table are free-field levels; those in `diffraction.ground_gain` include hard ground.
 GROUND_GAIN = np.sqrt(2.0)
-# Height and distance of the roofs, two storeys high, over which sounds outside both streets arrive.
+# Height and distance of the roofs, two storeys high, over which sound from outside both streets arrives.
 ROOF_HEIGHT_M, ROOF_AWAY_M = 7.0, 4.0
 # Generated at the microphones, without a position
 WEATHER = {"rain": add_rain, "gusts": add_gusts, "wind": add_wind}
@@ -115,7 +116,7 @@ def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.rando
 def _add_from(
     street: StreetSound, signal: Float32Array, track: SoundTrack, kind: SoundKind, rng: np.random.Generator
 ) -> None:
-    """Add a sound by every path; walls and the late field receive its mean over all directions."""
+    """Add a sound along every path; walls and the late field receive its mean over all directions."""
     static, site, receiver = street.static, street.site, street.receiver
     rate, ego_x = receiver.sample_rate_hz, receiver.ego.x_m(track.time_s)
     angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad

@@ -30,7 +30,7 @@ def octave_noise(octaves_db: ArrayLike, samples: int, rate_hz: float, rng: np.ra
 def harmonics(frequency_hz: FloatArray, amplitudes: Sequence[float], rate_hz: float) -> FloatArray:
     r"""Return multiples of a changing frequency, :math:`\sum_k a_k \sin k\phi(t)`, below Nyquist."""
     phase = 2.0 * np.pi * np.mod(np.cumsum(frequency_hz) / rate_hz, 1.0)
-    # sin (k + 1) p = 2 cos p sin k p - sin (k - 1) p: one sine in place of one per partial.
+    # sin (k + 1) p = 2 cos p sin k p - sin (k - 1) p: all partials together need one sine.
     twice_cosine, before, now = 2.0 * np.cos(phase), np.zeros_like(phase), np.sin(phase)
     out = np.zeros_like(phase)
     audible = max(int(0.5 * rate_hz / float(frequency_hz.max())), 1)

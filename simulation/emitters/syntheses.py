@@ -33,7 +33,7 @@ HIGH_VOICE_HZ, SHORT_TRACT = 160.0, 1.15  # A shorter vocal tract has higher for
 # A syllable takes a quarter of a second: the modulation of speech is strongest at 3 to 6 Hz.
 SYLLABLE_S, CLOSURE_S, PHRASE, SPEECH_PAUSE_S = (0.14, 0.24), (0.03, 0.07), (5, 12), (0.25, 0.6)
 SYLLABLE_SPREAD_DB = 2.0
-# The glottal flow falls with 12 dB per octave above its corner, and the mouth radiates its derivative.
+# The glottal flow falls by 12 dB per octave above its corner, and the mouth radiates its derivative.
 GLOTTAL_CORNER_HZ = 150.0
 FRICATIVE_SHARE, FRICATIVE_S = 0.5, (0.05, 0.1)
 FRICATIVE_DB, FRICATIVE_GAIN = (-40.0, -40.0, -40.0, -40.0, -12.0, -6.0, 0.0, 0.0), 0.1
@@ -79,7 +79,7 @@ def _vowels(
     syllables: Spans,
     rng: np.random.Generator,
 ) -> Complex128Array:
-    """Return the spectrum of the pulse train through a vowel in every syllable, shape (n // 2 + 1,)."""
+    """Return the spectrum of the pulse train, filtered by one vowel per syllable, shape (n // 2 + 1,)."""
     frequency_hz = rfftfreq(n, 1.0 / rate_hz)
     strength = 10.0 ** (SYLLABLE_SPREAD_DB * rng.standard_normal(len(syllables)) / 20.0)
     vowel = rng.integers(len(formants_hz), size=len(syllables))
@@ -286,7 +286,7 @@ def drums(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     return out
 
 
-# A bark: harmonics that rise and fall by a third, rough by a share of noise, in series (assumed, from a
+# A series of barks: harmonics whose pitch rises and falls by a third, with a share of noise (assumed, from a
 # lapdog to a large dog).
 BARK_HZ, BARK_S, BARK_RISE, ROUGH = (250.0, 900.0), (0.08, 0.35), 0.35, 0.8
 BARKS_GAP_S, QUIET_SHARE, QUIET_S = (0.25, 1.5), 0.2, (1.0, 3.0)
@@ -308,7 +308,7 @@ def dog(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     return out
 
 
-# A shot is a blast and the echo of the place; bursts have an even pace (assumed).
+# A shot is a blast with an echo; the shots of a burst are evenly spaced (assumed).
 BLAST_DECAY_S, ECHO, ECHO_S = (0.005, 0.06), (0.02, 0.25), (0.1, 0.7)
 BURST_S, SINGLE_S = (0.08, 0.6), (0.8, 4.0)
 
@@ -399,8 +399,8 @@ def _add_note(out: FloatArray, at_s: float, rate_hz: float, note: tuple[float, f
 # tone is assumed. Its compressed-air horns have most energy above 1 kHz: the technical rules of DIN 14610
 # require a harmonic of 104 dB there.
 TWO_TONES_HZ, TONE_S, GLIDE_S = (410.0, 547.0), 0.75, 0.03
-# These signs give the lowest peak, 4 dB above the rms; partials in phase have 10 dB, which are trains of
-# clicks that clip at the microphones long before a tone does.
+# These signs give the lowest peak, 4 dB above the RMS. Partials in phase have 10 dB: they are trains of
+# clicks, which clip at the microphones at a much lower level.
 HORN_PARTIALS = (0.5, 0.7, -1.0, 1.0, 0.9, 0.7, 0.5, -0.35, -0.25, -0.18, 0.12, 0.08)
 # Wail of an electronic siren: 10 to 30 cycles per minute (13 CCR 1028); its span is assumed.
 WAIL_HZ, WAILS_HZ = (600.0, 1400.0), (0.2, 0.35)
@@ -409,7 +409,8 @@ WAIL_PARTIALS = (1.0, 0.1, 0.35, 0.05, 0.2, 0.03, 0.1)  # Nearly a square wave
 DISCS_HZ, DISC_SPREAD = (420.0, 505.0), 0.05
 DISC_PARTIALS = (0.3, 0.3, 0.4, -0.6, -0.9, -1.0, 0.9, -0.7, -0.4, 0.25, -0.15, 0.1)
 BLAST_S, PAUSE_S = (0.3, 1.2), (0.4, 2.0)
-# One tone between 1 and 1.2 kHz, half of a second on and half off (assumed within SAE J994).
+# One tone between 1 and 1.2 kHz, on for half of each second and off for the other half (assumed within SAE
+# J994).
 BEEP_HZ, BEEPS_HZ = (1000.0, 1200.0), (0.95, 1.05)
 BEEP_PARTIALS = (1.0, 0.05, 0.1)
 
@@ -489,10 +490,11 @@ def beeper(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray
     return beeps * harmonics(np.full(samples, rng.uniform(*BEEP_HZ)), BEEP_PARTIALS, rate_hz)
 
 
-# Hammer drills strike 25 to 80 times per second, breakers 9 to 30 times (manufacturers' data; the envelopes
-# of seven real breakers 9 to 21), not quite evenly, and slower under load. Each blow excites modes of bit,
-# body and ground, which ring for some cycles, and a burst of noise; between blows motor or air are audible.
-# Fitted to the features of real drilling and jackhammers (docs/evidence/foreign_sounds.md).
+# Hammer drills strike 25 to 80 times per second, breakers 9 to 30 times (manufacturers' data; 9 to 21 in the
+# envelopes of seven real breakers). The blows are not quite even and are slower under load. Each blow excites
+# modes of bit, body and ground, which ring for some cycles, and a burst of noise. Between blows the motor or
+# the air is audible. Fitted to the features of real drilling and jackhammers
+# (docs/evidence/foreign_sounds.md).
 DRILL_BLOWS_HZ, BREAKER_BLOWS_HZ = (25.0, 80.0), (9.0, 30.0)
 UNEVEN_BLOWS, BLOW_SPREAD_DB, BLOW_DRIFT = (0.002, 0.03), (0.5, 3.0), (0.01, 0.08)
 MODES, MODE_HZ, MODE_CYCLES, LONGEST_MODE_S = (3, 10), (120.0, 5000.0), (2.0, 15.0), 0.04
@@ -500,8 +502,8 @@ IMPACT_S, IMPACT, BETWEEN, MOTOR = (0.003, 0.03), (0.1, 2.0), (0.05, 1.0), (0.3,
 BLOW_DB = (-8.0, -5.0, -3.0, 0.0, 0.0, -2.0, -5.0, -8.0)
 DRILLED_S, BROKEN_S, REST_S = (0.4, 5.0), (3.0, 15.0), (0.2, 2.0)
 # Circular saws, grinders, drills without blows: a motor or a blade of 50 to 500 turns per second, with teeth
-# or gears that whine up to 5 kHz (manufacturers' data: 24 or 40 teeth at 55 to 75 turns, a motor's 100 to
-# 500). It runs up, slows down under load, and runs out.
+# or gears that whine up to 5 kHz (manufacturers' data: 24 or 40 teeth at 55 to 75 turns, motors at 100 to
+# 500). The speed rises at the start, drops under load and falls at the end.
 MOTOR_HZ, GEARS_HZ, RUN_S = (50.0, 500.0), (50.0, 5000.0), (0.05, 0.8)
 LOAD_S, LOADED_S, MOST_SAG, LOADED_DB = (0.2, 2.0), (0.1, 1.5), 0.35, (0.0, 12.0)
 GRIND_DB = (-25.0, -20.0, -15.0, -10.0, -4.0, 0.0, 2.0, 0.0)

@@ -28,23 +28,22 @@ from .emitter import a_weight, a_weighted
 from .signals import add_ringing, bursts, gate, octave_noise
 
 # Drops per second on the sheet metal within a hand's breadth of a microphone (assumed: moderate rain, 4
-# mm/h), the damped modes that each excites, and the level of the largest: masses have an exponential
-# distribution.
+# mm/h). Each drop excites damped modes; masses have an exponential distribution.
 DROPS_HZ = 40.0
 MODES = ((700.0, 1.0, 0.006), (1600.0, 0.8, 0.004), (3300.0, 0.6, 0.0025), (5800.0, 0.3, 0.0015))
 # Rain on paving has energy from 1 kHz up (assumed); it arrives from all azimuths and somewhat from above.
 FAR_DB = (-20.0, -16.0, -12.0, -8.0, -4.0, 0.0, 2.0, 2.0)
 FAR_WAVES, FAR_LIFT_RAD = 24, 0.3
 FAR_SHARE = 0.3  # Share of the energy at a microphone
-# Levels are those of the whole sound: at a low sample rate a part of it is missing.
+# Levels refer to the full band, of which a low sample rate contains only a part.
 WHOLE_HZ = np.arange(1.0, 20_000.0, 5.0)
-SHOWER_RAMP_S = 0.5  # Time in which a shower starts
+SHOWER_RAMP_S = 0.5  # Duration of the rise at the start of a shower
 
 
 def add_rain(
     static: StaticSources, sound: SoundSettings, receiver: Receiver, rng: np.random.Generator
 ) -> None:
-    """Add rain to all microphones, at its level at each of them."""
+    """Add rain to all microphones; its level applies at each of them."""
     rate, samples = receiver.sample_rate_hz, static.out.shape[1]
     level = REFERENCE_PA * 10.0 ** ((sound.what.level_db + sound.level_offset_db) / 20.0)
     begin = sound.start_s - receiver.knots_s[0]
@@ -123,7 +122,7 @@ def add_wind(
     level_db = sound.what.level_db + sound.level_offset_db
     density = wind_density(level_db, noise_frequencies(samples, rate), ROOF_SLOPE, ROOF_FLOOR_HZ) * rate
     begin = sound.start_s - receiver.knots_s[0]
-    # It rises for half of its time and falls for the other half.
+    # The swell rises for half of its duration and falls for the other half.
     swell = gate(samples, rate, [(begin, begin + sound.duration_s)], sound.duration_s).astype(np.float32)
     for channel, draws in zip(static.out, rng.spawn(len(static.out)), strict=True):
         channel += swell * shaped_noise(density, samples, draws)

@@ -20,7 +20,7 @@ MOVING_SITES = ("DA1", "DA2", "DB1", "DB2", "DB3")  # The same places with an eg
 MAX_OCCLUDERS = 4
 # Fixed or drawn sites at which the ego moves, at the place S.., T.. or M..: DA1, DTA101
 _MOVING = re.compile(r"D([TM]?)([AB]\d+)")
-# By the first letter of a drawn place: TA1, MB917. All other sites use the paths of their plan.
+# Renderer by the first letter of a drawn place (TA1, MB917). All other sites use the renderer "paths".
 _RENDERERS = {"T": "rays", "M": "mirrors"}
 _DRAWN = re.compile(r"[TM][AB]\d{1,6}")
 # The fits require smooth side walls and a rough facade opposite (shop fronts, doors, parked bicycles).
@@ -53,10 +53,10 @@ class Site:
     roughness : tuple of (float, float)
         Scattering of the side walls and of the crossing street's facades relative to the preset's, 0..6.
     surface_db : float
-        Level of vehicles on its roadway relative to the preset's, -12 to 12: smooth asphalt, setts.
+        Level of vehicles on its roadway relative to the preset's, -12 to 12, from smooth asphalt to setts.
     left_openings_m, right_openings_m : tuple of (float, float)
-        Stretches along x without a side wall: driveways, set-back fronts, and the regions before its start
-        and after its end.
+        Stretches along x without a side wall: driveways, set-back fronts, and the regions before the
+        wall's start and after its end.
     side_reflection, facade_reflection : float
         Pressure reflection factors of the side walls and of the crossing street's facades, 0..1.
     side_order, facade_order : int
@@ -150,7 +150,7 @@ class Site:
     def sights_m(
         self, ahead_m: FloatArray, eye_m: tuple[float | FloatArray, float]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return those limits for distances and viewpoints that change, shape (T,) each."""
+        """Return the limits of `sight_m` for distances and viewpoints that change, shape (T,) each."""
         x, y = eye_m
         reach = (ahead_m - x) / (self.corner_ahead_m - x)
         return y + (-self.corner_right_m - y) * reach, y + (self.corner_left_m - y) * reach
@@ -202,13 +202,14 @@ def site(name: str) -> Site:
     return PLANS[name] if name in PLANS else drawn_site(name)
 
 
-# Fitted. A search minimised the difference between the expected pattern (energies of all paths, beams of the
-# array, an ambience that gives the site's empty windows) and the mean released pattern, hidden and in front,
-# by side and half, averaged over the drawn speeds; the antisymmetric part had its own weight. The search
-# started from the published plans of a type A and a type B junction (corners 2.8 m aside, 4.5 m ahead),
-# changed them by up to 0.7 m and leaves 0.07, 0.13 and 0.09 nepers rms. The former plans and drivers, with a
-# free vehicle level, left 0.13, 0.23 and 0.13. A wall that is nearer than its corner ends at the line of
-# sight to the corner; a longer wall would be visible and hide the street.
+# Fitted: a search minimised the difference between expected and mean real patterns (released features), of
+# hidden vehicles and of vehicles in front, by side and half of the window. The expected pattern combines the
+# energies of all paths, the beams of the array and an ambience that gives the site's empty windows, and is
+# averaged over the drawn speeds. The antisymmetric part had its own weight. The search started from the
+# published plans of a type A and a type B junction (corners 2.8 m aside, 4.5 m ahead), changed them by up to
+# 0.7 m and leaves 0.07, 0.13 and 0.09 nepers rms. The former plans and drivers, with a free vehicle level,
+# left 0.13, 0.23 and 0.13. A wall that is nearer to the ego's axis than its corner ends at the line of sight
+# to the corner; a longer wall would be visible and hide the street.
 PLANS = {
     "SA1": Site(
         "SA1",
@@ -318,8 +319,8 @@ WIDEST_CORNER, CAMERA_BEHIND_M = 0.65, 0.57
 def _wider_site(name: str, rng: np.random.Generator) -> Site:
     """Draw a site of the other renderers: its streets are wider and more varied than the fitted family."""
     corners, ahead = rng.uniform(2.2, 8.0, 2), rng.uniform(3.0, 10.0)
-    # At a corner outside the image a vehicle passes before the camera sees it, and T0 would not be line of
-    # sight.
+    # If a corner were outside the image, a vehicle could pass it before the camera sees the vehicle, and T0
+    # would not be line of sight.
     left, right = np.minimum(corners, WIDEST_CORNER * (ahead + CAMERA_BEHIND_M)).tolist()
     verge, street = rng.uniform(0.3, 3.5), rng.uniform(4.0, 9.0)
     opposite = ahead + verge + street + rng.uniform(0.3, 4.0) if name[1] == "A" else None
@@ -419,7 +420,7 @@ def wide_crossing() -> Place:
 
 
 def one_corner() -> Place:
-    """Return a crossing with a house on the left alone: the right side has direct sound and a clear view."""
+    """Return a crossing with one house, on the left; the right side has direct sound and a clear view."""
     house = OccludingBody(((-60.0, 2.8), (4.5, 2.8), (4.5, 60.0), (-60.0, 60.0)))
     ways = Way("left", ((6.5, 60.0), (6.5, -60.0))), Way("right", ((9.5, -60.0), (9.5, 60.0)))
     return _open("SC1", (*ways, TURNS_OFF_AHEAD, TURNS_OFF_BEHIND), house)

@@ -1,7 +1,7 @@
 """Kinds of road users as parameters: length, height, and sound power at each speed.
 
 Light, medium and heavy vehicles and motorcycles are categories 1 to 4 of CNOSSOS-EU. Electric cars, bicycles
-and trams are not in it: they are stated assumptions, compared with published pass-by levels (see each).
+and trams are not in it: their values are assumed and compared with published pass-by levels (see each kind).
 """
 
 from dataclasses import dataclass, replace
@@ -35,9 +35,9 @@ class VehicleKind:
     # Sound power level of the tyres per octave, L = A + B log10(v / 70 km/h), dB re 1 pW.
     rolling_a_db: Octaves
     rolling_b_db: Octaves
-    propulsion_a_db: Octaves  # That of the engine, L = A + B (v - 70) / 70
+    propulsion_a_db: Octaves  # Sound power level of the engine, L = A + B (v - 70) / 70
     propulsion_b_db: Octaves
-    # Above this speed it fades out within 5 km/h: the warning sound of electric cars
+    # Above this speed the propulsion part fades out within 5 km/h: the warning sound of electric cars
     propulsion_until_kmh: float = np.inf
     engine_m: float = 0.3  # Height of the engine as a source; tyres are at `TYRE_M`
     ridden_mps: tuple[float, float] | None = None  # Range of speeds, if it differs from that of the street
@@ -86,8 +86,7 @@ HEAVY = VehicleKind(
     engine_m=0.75,
 )
 # Tyres of a light vehicle. In place of the engine, the warning sound of UN Regulation No. 138 up to 20 km/h:
-# at least 50 dB(A) at 2 m at 10 km/h and 56 dB(A) at 20 km/h, some 70 dB of sound power, from 250 Hz to 2
-# kHz.
+# at least 50 dB(A) at 2 m at 10 km/h and 56 dB(A) at 20 km/h, about 70 dB sound power, from 250 Hz to 2 kHz.
 ELECTRIC = replace(
     LIGHT,
     name="electric",
@@ -111,7 +110,7 @@ BICYCLE = replace(
     harmonic_share=0.0,
 )
 # Electric kick scooter: small hard tyres and a hub motor, 4 dB above a bicycle (assumed). It emits noise
-# only, because the model's engine lines follow the gears of a car.
+# only, because the model's engine harmonics follow the gears of a car.
 SCOOTER = replace(
     BICYCLE,
     name="scooter",
@@ -124,8 +123,9 @@ SCOOTER = replace(
     propulsion_b_db=(0.0, 0.0, 20.0, 20.0, 20.0, 20.0, 20.0, 0.0),
     engine_m=0.1,
 )
-# Wheel and rail at street speeds, some 72 dB(A) at 7.5 m at 30 km/h; four bogies, traction noise far below.
-# The shape follows the third-octave spectra of 32 real passes: maximum at 250 Hz, 24 dB less at 2 kHz.
+# Noise of wheels and rails at street speeds, about 72 dB(A) at 7.5 m at 30 km/h, from four bogies; traction
+# noise is far below. The spectrum follows the third-octave spectra of 32 real passes: maximum at 250 Hz, 24
+# dB less at 2 kHz.
 TRAM = replace(
     LIGHT,
     name="tram",

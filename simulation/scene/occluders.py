@@ -44,7 +44,7 @@ class OccludingBody:
 class Wall:
     """A long side of a body, seen from outside."""
 
-    start_m: tuple[float, float]  # Its two ends
+    start_m: tuple[float, float]  # The two ends of the wall
     end_m: tuple[float, float]
     outward: int  # Outer side of the line from start to end: +1 left, -1 right, 0 both
 

@@ -53,7 +53,7 @@ def split_octaves(signal: Float32Array, sample_rate_hz: float, oversampling: int
     return bands
 
 
-# The seven sources of one vehicle have the same length.
+# One entry serves all seven sources of a vehicle, which have the same length.
 @lru_cache(maxsize=2)
 def _masks_for(samples: int, sample_rate_hz: float) -> Float32Array:
     return octave_masks(rfftfreq(samples, 1.0 / sample_rate_hz)).astype(np.float32)

@@ -1,44 +1,48 @@
 """Levels and spectra of everything that is not geometry, as named and frozen presets.
 
 `street-6` changed the physics of `street-5`. Each site has its own ambient level, spectrum, wind and openings
-(`ambience.py`). Ambience and distant traffic enter through these openings as extended sources that fluctuate
-and move slowly; before, a distant vehicle was one plane wave, or two with its echo. The background passes
-through the same channel mismatch as vehicles. Vehicles vary more in level and in engine load, which follows
-the acceleration.
+(`Ambience`). Ambience and distant traffic enter through these openings as extended sources that fluctuate and
+move slowly; in `street-5` a distant vehicle was one plane wave, or two with its echo. The channel mismatch
+applies to the background as it does to vehicles. Vehicles vary more in level and in engine load, which
+follows the acceleration.
 
-Levels and spreads were fitted to the released windows of SA1, SB1 and SB2 (moving ego: DA1, DB1), first by
-hand in some fifty trials. Then the parts of 36 approaches and 36 empty windows (tyres and engine by mirrored,
-scattered and late paths; ambience) were rendered once and mixed at other levels. A random search of some 350
-steps minimised the summed squared differences of level, peak, prominence, change and spread of the level,
-overall and per site. The result was rounded and checked with other seeds. Its main finding: low bins, at
-which the array cannot resolve directions, must be incoherent (`wind_100hz_db`, `engine_bass_db`) and high
+Levels and spreads were fitted to OVAD's released windows of SA1, SB1 and SB2 (moving ego: DA1, DB1), first by
+hand in some fifty trials. Then the parts of 36 approaches and 36 empty windows (tyres and engine along
+mirrored, scattered and late paths; ambience) were rendered once and mixed at other levels. A random search of
+about 350 steps minimised the summed squared differences of level, peak, prominence, change and spread of the
+level, overall and per site. The result was rounded and checked with other seeds. The main finding: low bins,
+at which the array cannot resolve directions, must be incoherent (`wind_100hz_db`, `engine_bass_db`) and high
 bins coherent (`delay_mismatch_s`); otherwise no vehicle is prominent. The search used no classifier and no
-false alarm.
+count of false alarms.
 
 The plans of sites and the drivers were fitted after that search. Four joint checks of 8 to 12 windows per
 class, side and site then changed the wind, the late field and the level of vehicles by a few dB. The last
-check, seed 203, gave (real, simulated): hidden level 0.192, 0.191, peak 0.280, 0.289, prominence 1.44, 1.50,
-change 0.173, 0.177, deviation of the log level 0.113, 0.125; in front 0.196, 0.201 and 0.328, 0.347 and 1.80,
-1.86 and 0.222, 0.206 and 0.106, 0.116; empty 0.149, 0.153 and 0.193, 0.192 and 1.25, 1.23 and 0.050, 0.059
-and 0.305, 0.226. Remaining differences: hidden windows of SB1 are quieter in reality (0.186, 0.164), and
-their pattern has deeper valleys (deviation 0.379, 0.477); for a moving ego simulated windows are a quarter
-too loud (empty 0.157, 0.198) and hidden vehicles too prominent (1.17, 1.28).
+check (seed 203) gave, for real and simulated windows:
+
+- hidden: level 0.192, 0.191; peak 0.280, 0.289; prominence 1.44, 1.50; change 0.173, 0.177; deviation of the
+  log level 0.113, 0.125;
+- in front: 0.196, 0.201; 0.328, 0.347; 1.80, 1.86; 0.222, 0.206; 0.106, 0.116;
+- empty: 0.149, 0.153; 0.193, 0.192; 1.25, 1.23; 0.050, 0.059; 0.305, 0.226.
+
+Remaining differences: real hidden windows of SB1 are quieter (0.186, 0.164), and their pattern has deeper
+valleys (deviation 0.379, 0.477). For a moving ego, simulated windows are a quarter too loud (empty 0.157,
+0.198) and hidden vehicles too prominent (1.17, 1.28).
 
 `street-7` is fitted to the inputs of a sequence in 23 approaches and 22 hazard-free recordings at SA1, SB1
 and SB3 (two microphones): level and bands by time before T0, and their deviation and autocorrelation without
 a vehicle. Vehicles are a quarter faster (seven real ones pass SB1 at 5.0 to 6.5 m/s), which makes their tyres
 2.9 dB louder; their level is 4.5 dB lower. Between walls the late field is 3 dB lower, distant vehicles are 2
 dB lower, the ambience has more energy at 1 and 2 kHz, and the whole background flickers. Seven candidates
-were rendered at four junctions; the chosen one has the smallest distance of the median column to SA1 and SB1.
-No classification score was used.
+were rendered at four junctions; the chosen one has the smallest distance to SA1 and SB1, as the median over
+the inputs. No classification score was used.
 
-`street-6-calm` is a street with half as many distant vehicles, 4 dB fainter.
+`street-6-calm` has half as many distant vehicles, 4 dB fainter.
 
 Two earlier choices used evaluation data. The wind and drivers of `street-5` were set on medians of the same
 sites, and its distant vehicles on the published false alarms. `street-2` was chosen after one look at a
 classifier's scores on simulated windows; the part of it that remains (ambient octaves) is older than that
-look. Earlier presets are not offered, because their physics no longer exists. A changed preset gets a new
-name.
+look. Earlier presets are not offered, because the code of their physics was removed. A changed preset gets a
+new name.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -102,7 +106,7 @@ class Preset:
         Mean level of vehicles relative to CNOSSOS on its reference asphalt, and its standard deviation; the
         road surface of a site is added to the tyres.
     traced_vehicle_db : float
-        Added to that mean in streets of the second renderer, which are wider.
+        Level that is added to that mean in streets of the second renderer, which are wider.
     speed_factor : float
         Speed of vehicles relative to `SPEEDS_MPS`.
     engine_spread_db : float
@@ -231,10 +235,11 @@ def preset(name: str = DEFAULT_PRESET) -> Preset:
 OPENINGS = ("left", "right", "ahead", "behind")
 # Neighbouring octaves of traffic noise rise and fall together: a common tilt and a small residue.
 TILT_DB_PER_OCTAVE, OCTAVE_SPREAD_DB = 0.7, 0.7
-# Share of the sound from ahead that passes over a facade opposite, two or three floors high.
+# Level of the sound from ahead that passes over a facade opposite, two or three floors high.
 OVER_THE_WALL_DB = -8.0
-# Low between walls, high on an open corner: levels of the released windows of SB1, hidden and in front alike,
-# spread three times as far as those of SA1 and SB2. The logarithm is drawn uniformly.
+# Factor on the spread of the wind: low between walls, high at an open corner. The levels of released windows
+# of SB1, hidden and in front alike, spread three times as far as those of SA1 and SB2. The logarithm is drawn
+# uniformly.
 GUSTINESS = (0.13, 2.5)
 TURNED_RAD = 0.12  # No street is exactly in line with another
 
@@ -243,7 +248,7 @@ TURNED_RAD = 0.12  # No street is exactly in line with another
 class Ambience:
     """Ambient field of one site, or of one recording there.
 
-    A court at night and a street beside a main road differ by more than two recordings of either. Level,
+    A court at night and a street beside a main road differ more than two recordings of the same place. Level,
     spectrum and openings of a site are drawn once from its name and are the same in all its recordings.
     """
 

@@ -1,7 +1,7 @@
 """Settings of a recording: site, approach, motion of the vehicles, and further sounds, given or drawn.
 
-Levels of sounds are A-weighted, in dB re 20 uPa at 1 m in front in the free field, over the eighths of a
-second within 10 dB of the loudest. The level of a horn is that of its blast, whatever its pauses are.
+Levels of sounds are A-weighted, in dB re 20 uPa at 1 m in front in the free field, over all blocks of 1/8 s
+within 10 dB of the loudest. So the level of a horn is that of its blasts, without its pauses.
 """
 
 from collections.abc import Sequence
@@ -26,18 +26,19 @@ class SoundKind:
 
     name: str
     label: str
-    level_db: float  # Defined at the head of this file; for rain and gusts, the level at a microphone
+    level_db: float  # See the head of this file; for rain and gusts, the level at a microphone
     height_m: float = 1.0
-    # Level behind relative to ahead, per octave; in between the mean over (1 + cos angle) / 2.
+    # Level behind relative to ahead, per octave. The amplitude at other angles is a mean with the weight (1 +
+    # cos angle) / 2 for ahead.
     back_db: Octaves = FLAT
-    origin: str = PLACE  # Its carrier: PLACE, VEHICLE or MICROPHONES
+    origin: str = PLACE  # Origin of the sound: PLACE, VEHICLE or MICROPHONES
     faces: float = 1.0  # Signals of a vehicle: 1 from the front forwards, -1 from the rear backwards
 
 
 # A talker's head shadows high frequencies, after the polar patterns of Chu and Warnock, "Detailed directivity
 # of sound fields around human talkers", NRC Canada, 2002; rounded.
 HEAD_DB: Octaves = (-1.0, -2.0, -3.0, -5.0, -6.0, -9.0, -14.0, -18.0)
-# A piston of 0.1 m in a box is directional if its circumference exceeds a wavelength, some 500 Hz (assumed).
+# A piston of 0.1 m in a box is directional if its circumference exceeds a wavelength, about 500 Hz (assumed).
 BOX_DB: Octaves = (0.0, -1.0, -3.0, -7.0, -11.0, -15.0, -18.0, -20.0)
 # A horn mouth on a car's front or roof, and the car's body behind it (assumed).
 MOUTH_DB: Octaves = (-2.0, -3.0, -6.0, -9.0, -12.0, -15.0, -17.0, -18.0)
@@ -45,12 +46,12 @@ MOUTH_DB: Octaves = (-2.0, -3.0, -6.0, -9.0, -12.0, -15.0, -17.0, -18.0)
 _TABLE = (
     # ISO 9921:2003: raised effort is 66 dB(A) at 1 m with pauses, normal effort 60, loud 72.
     SoundKind("voice", "one talker, raised effort", 68.3, 1.5, HEAD_DB),
-    # Assumed: a few children at play, and a dog in a yard, some 90 dB(A) at 1 m.
+    # Assumed: a few children at play, and a dog in a yard, about 90 dB(A) at 1 m.
     SoundKind("children", "children at play", 78.0, 1.0, HEAD_DB),
     SoundKind("dog", "barking dog", 90.0, 0.5, HEAD_DB),
     # Hard heels on paving; assumed.
     SoundKind("steps", "one person walking", 58.0, 0.05),
-    # Assumed: some 65 dB(A) at 100 m.
+    # Assumed: about 65 dB(A) at 100 m.
     SoundKind("bell", "church bell", 105.0, 25.0),
     # Manufacturers declare 90 to 100 dB(A) at the operator for hand-held tools; assumed.
     SoundKind("saw", "circular saw, grinder or another machine with a motor", 95.0, 1.0),
@@ -113,7 +114,7 @@ class SoundSettings:
     route_m : tuple of (float, float)
         Further points of its route; empty for a sound at rest.
     speed_mps : float
-        Speed on that route, up to 30; the sound rests at its end.
+        Speed on that route, up to 30; afterwards the sound rests at its end.
     level_offset_db : float
         Added to the level of its kind.
     facing_rad : float, optional
@@ -161,21 +162,21 @@ class SoundSettings:
 
     @property
     def what(self) -> SoundKind:
-        """Its kind."""
+        """Kind of the sound."""
         return sound_kind(self.kind)
 
     @property
     def has_place(self) -> bool:
-        """Whether it has a position and is not generated at the microphones."""
+        """Whether the sound has a position and is not generated at the microphones."""
         return self.what.origin != MICROPHONES
 
     @property
     def end_s(self) -> float:
-        """Time of its end."""
+        """Time at which the sound ends."""
         return self.start_s + self.duration_s
 
     def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return its position, x and y, shape (T,) each."""
+        """Return the position of the sound, x and y, shape (T,) each."""
         if not self.route_m:
             return tuple(np.full_like(time_s, value) for value in self.place_m)  # type: ignore[return-value]
         points = np.array((self.place_m, *self.route_m))
@@ -183,7 +184,7 @@ class SoundSettings:
         return along(points).at(np.clip(self.speed_mps * (time_s - self.start_s), 0.0, length))
 
     def facing(self, time_s: FloatArray) -> FloatArray:
-        """Return the direction that it faces, rad, shape (T,)."""
+        """Return the direction that the sound faces, rad, shape (T,)."""
         if self.route_m:
             (x, y), (ahead_x, ahead_y) = self.at(time_s - 0.5), self.at(time_s + 0.5)
             return np.arctan2(ahead_y - y, ahead_x - x)
@@ -197,7 +198,8 @@ MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
 MAX_OTHERS, MAX_SOUNDS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 16, 64, 0.1
 # Fitted to the motion of the released patterns in the two seconds round T0: 3 to 5 m/s at all three fitted
-# places, with little braking. Drivers at 9 m/s with 3 m/s2 of braking were half a second late in front.
+# places, with little braking. With drivers at 9 m/s and 3 m/s2 of braking, simulated vehicles arrived in
+# front half a second late.
 SPEEDS_MPS, WALLED_SPEEDS_MPS = (3.8, 6.2), (3.4, 4.8)
 BRAKING_SHARE, BRAKING_MPS2 = 0.6, (0.3, 1.4)
 EGO_SPEEDS_MPS, EGO_STOPS_AFTER_S = (10.0 / 3.6, 30.0 / 3.6), (0.3, 2.0)
@@ -211,8 +213,9 @@ def rate_for(bandwidth_hz: float) -> float:
     >>> rate_for(2000.0), rate_for(2500.0), rate_for(16_000.0)
     (6000.0, 12000.0, 47998.0)
     """
-    # Halvings of the full rate keep the bins: frames of 512 samples become 256, 128 or 64. Files need integer
-    # rates: 5,999.75 Hz read as 6,000 would be late by a tenth of a second after an hour.
+    # Halving the full rate keeps the bins, because frames of 512 samples become 256, 128 or 64. Files need
+    # integer rates: if 5,999.75 Hz were read as 6,000 Hz, the error would be a tenth of a second after an
+    # hour.
     halvings = max(int(np.floor(np.log2(SAMPLE_RATE_HZ / (3.0 * bandwidth_hz)) + 1e-3)), 0)
     return float(round(SAMPLE_RATE_HZ / 2**halvings))
 
@@ -301,7 +304,7 @@ class SimulationSettings:
     kind, manoeuvre, route_m, signal
         Of the vehicle: see `VehicleSettings`.
     others : tuple of VehicleSettings
-        At most 8 further vehicles; with `approach` "none" they are all, and none is a hidden hazard.
+        At most 8 further vehicles; with `approach` "none" they are all, and none of them is a hidden hazard.
     ego : EgoMotion
         Motion of the ego; it stands by default.
     sounds : tuple of SoundSettings
@@ -441,7 +444,7 @@ def _draw_ego(rng: np.random.Generator, duration_s: float) -> EgoMotion:
     return EgoMotion(rng.uniform(*EGO_SPEEDS_MPS), stop_s)
 
 
-# Share of the recording in which a sound is audible; rain and music last.
+# Share of the recording in which a sound is audible; the kinds of `LASTING` last throughout.
 SHARE, LASTING = (0.3, 0.8), ("rain", "music", "bell")
 WALKING_MPS = (1.1, 1.6)
 NEAR_M, SIDE_STREET_M = (3.0, 12.0), (6.0, 30.0)  # Behind the ego, and along the crossing street
@@ -480,7 +483,7 @@ def _drawn(
     start = rng.uniform(0.0, whole - long) if long < whole else 0.0
     if kind == "gusts":
         count = int(rng.integers(1, min(MAX_GUSTY, microphones) + 1))
-        # Neighbouring microphones: a gust is as wide as an arm.
+        # A gust is narrow: it hits neighbouring microphones.
         first = int(rng.integers(microphones - count + 1))
         return SoundSettings(kind, start, long, channels=tuple(range(first, first + count)))
     if kind == "wind":

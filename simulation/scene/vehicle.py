@@ -16,7 +16,7 @@ from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 FAR_M = 600.0  # Straight extension of a route at both ends
 TURN_RADIUS_M = 3.5
 LANE_FROM_MIDDLE_M = 1.2  # Lateral position of a vehicle that has turned into the ego's street
-STOP_AHEAD_M = 3.0  # It stops here, in front of the ego
+STOP_AHEAD_M = 3.0  # Distance ahead of the ego at which such a vehicle stops
 ARC_STEPS = 24
 
 
@@ -28,7 +28,7 @@ class Route:
     points_m: FloatArray  # shape (N, 2): Positions there, x ahead and y left
 
     def at(self, driven_m: float | FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return x and y after a distance, shape of `driven_m`."""
+        """Return x and y after a driven distance, shape of `driven_m`."""
         along = np.asarray(driven_m)
         x, y = (np.interp(along, self.driven_m, column) for column in self.points_m.T)
         return np.asarray(x), np.asarray(y)
@@ -61,7 +61,7 @@ def turn_in(lane_x_m: float, entry_y_m: float) -> tuple[Route, float]:
     >>> [round(float(v), 2) for v in route.at(end)]
     [3.0, 1.2]
     """
-    # It keeps to its right and stops before the ego.
+    # The vehicle keeps to its right and stops in front of the ego.
     side = 1.0 if entry_y_m > 0 else -1.0
     begin_y = LANE_FROM_MIDDLE_M + side * TURN_RADIUS_M
     angle = np.linspace(0.0, 0.5 * np.pi, ARC_STEPS)
@@ -111,7 +111,7 @@ class EgoMotion:
 
     @property
     def stands(self) -> bool:
-        """Whether it is always at rest."""
+        """Whether the ego is always at rest."""
         return self.speed_mps == 0.0
 
     def later(self, start_s: float) -> "EgoMotion":
@@ -144,7 +144,8 @@ REFERENCE_KMH = 70.0
 # Sound power to pressure at 1 m over hard ground: -11 dB of a free sphere, +3 dB of the ground's half-space.
 POWER_TO_1M_DB = -8.0
 FADE_KMH = 5.0  # A warning sound that ends at some speed has faded out this much above it
-SLOWEST_KMH = 10.0  # The law is fitted above 20 km/h; the logarithm of zero speed would be silence
+# Lower speeds are set to this: the law is fitted above 20 km/h, and the logarithm of 0 is infinite
+SLOWEST_KMH = 10.0
 CREEPING_MPS = 1.0  # Below this speed tyre noise fades: a vehicle at rest is an engine alone
 HARMONIC_SHARE = 0.5  # Share of the propulsion power in harmonics; the rest is broadband
 HARMONICS = 24
@@ -154,8 +155,8 @@ GEARS_HZ_PER_MPS = (14.7, 8.0, 5.4, 4.0)
 SHIFT_UP_HZ, IDLE_HZ = 80.0, 28.0
 SHIFT_S = 0.4
 WANDER, WANDER_STEP_S = 0.05, 0.5
-# An engine under load is louder, one that is driven by the wheels quieter (source model of IMAGINE, light
-# vehicles); accelerations beyond these were not measured.
+# An engine under load is louder, and one that is driven by the wheels is quieter (source model of IMAGINE,
+# light vehicles). Accelerations outside the second pair were not measured.
 LOAD_DB_PER_MPS2, LOADS_MPS2 = 4.4, (-1.0, 2.0)
 TURN_MPS, TURN_BRAKING_MPS2 = 3.5, 2.0
 TURN_BEGINS_M = 12.0  # Longest distance before line of sight at which braking for the turn begins
@@ -291,7 +292,7 @@ def emit(
     rng: np.random.Generator,
     engine_offset_db: float | FloatArray = 0.0,
 ) -> list[SourceSignal]:
-    """Draw the signals of all tyres and of the engine, whose offset may differ by octave, (8, 1)."""
+    """Draw the signals of all tyres and of the engine; its level offset may differ by octave, (8, 1)."""
     # The tyres of the axles share the rolling noise but are uncorrelated, so that a vehicle in view is a wide
     # source. Engine noise, broadband and harmonics, is emitted at the first axle and higher up.
     kind = trajectory.kind
@@ -318,7 +319,7 @@ class _Drawing:
     rng: np.random.Generator
 
     def noise(self, octave_pressure: FloatArray, white: Float32Array | None = None) -> Float32Array:
-        """Return Gaussian or another white noise whose octave pressures (8, T) follow the motion."""
+        """Return noise, Gaussian or `white`, whose octave pressures (8, T) follow the motion."""
         if white is None:
             white = self.rng.standard_normal(len(self.time), dtype=np.float32)
         gains = octave_pressure / np.sqrt(_band_shares(self.sample_rate_hz))[:, None]
@@ -328,7 +329,7 @@ class _Drawing:
         return signal
 
     def engine(self, octave_pressure: FloatArray) -> Float32Array:
-        """Return noise and lines; an octave without a line is noise alone."""
+        """Return noise and harmonics; an octave without a harmonic contains noise alone."""
         if self.trajectory.kind.turns_hz is not None:
             return self.noise(octave_pressure, exhaust_pulses(self.trajectory, self.time, self.rng))
         share = self.trajectory.kind.harmonic_share
@@ -361,7 +362,7 @@ def _band_shares(sample_rate_hz: float) -> FloatArray:
 
 
 def octaves_of_lines(firing_hz: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the octave of each multiple of a firing frequency, (24,), and their number per octave, (8,)."""
+    """Return the octave of each multiple of a firing frequency, (24,), and the count per octave, (8,)."""
     orders = np.arange(1, HARMONICS + 1)
     octave = np.clip(np.round(np.log2(orders * firing_hz.mean() / OCTAVES_HZ[0])), 0, 7).astype(int)
     return octave, np.bincount(octave, minlength=8)
@@ -390,12 +391,12 @@ def firing_frequency_hz(trajectory: Trajectory, time: FloatArray, rng: np.random
 
 
 # A motorcycle has one to four cylinders; a moped has one two-stroke cylinder, which fires at every turn. The
-# cylinders fire unevenly and with different strength, which makes lines at half orders; the exhaust noise
-# follows them.
+# cylinders fire unevenly and with different strength, which adds partials at half orders; the level of the
+# exhaust noise follows them.
 TWO_STROKES, CYLINDERS, UNEVEN_FIRING, WEAKEST = 0.25, (1, 2, 2, 3, 4), 0.5, 0.6
 PULSE_SPREAD, PULSE_JITTER, MOST_NOISE, SHARPEST = (0.02, 0.3), (0.0, 0.02), 0.8, 6.0
-# Turns per second at idle, 1,100 to 1,900 per minute; ratio of neighbouring gears; share with a belt, whose
-# crank speed is nearly constant; share of vehicles at rest that rev up, and how far (all assumed).
+# Turns per second at idle, 1,100 to 1,900 per minute; ratio of neighbouring gears; share with a belt drive,
+# whose crank speed is nearly constant; share of vehicles at rest that rev up, and how far (all assumed).
 IDLE_TURNS_HZ, GEAR_RATIO, BELTS, BELT, REVVED, MOST_REVS = (18.0, 32.0), (1.25, 1.7), 0.25, 0.3, 0.6, 4.0
 TURNS_WANDER, LOUDER_BY_TURNS = 0.02, 1.5  # Amplitude over crank speed: 30 dB per decade (assumed)
 

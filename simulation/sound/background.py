@@ -22,8 +22,8 @@ from .paths import trace_paths
 from .receiver import Receiver
 from .static_field import azimuths_all_round, plane_wave_delays, unit_vectors
 
-# Long compared with the delays across an array (some 3 ms), which are circular within a block, and short
-# compared with the second in which a level changes.
+# Length of a block: long compared with the delays across an array (about 3 ms), which are circular within a
+# block, and short compared with the second in which a level changes.
 BLOCK_S = 0.043
 BLOCKS_AT_ONCE = 32
 NORMALS = 2**16
@@ -60,9 +60,9 @@ class WaveField:
 
     .. math:: X_m(f) = \sum_q \sqrt{G_q S(f)}\, e^{-2 \pi j f \tau_{qm}} W_q(f) + \sqrt{N(f)}\, V_m(f),
 
-    W and V are white. No wave exists as a signal, so the cost is one product and one transform per
-    microphone. Blocks are independent. The squares of their windows sum to one, so that the level is steady
-    while the powers G may change from block to block.
+    W and V are white noise. A wave is never computed as a signal, so the cost is one product and one
+    transform per microphone. Blocks are independent. The squares of their windows sum to one, so that the
+    level is steady while the powers G may change from block to block.
     """
 
     grid: BlockGrid
@@ -130,9 +130,9 @@ class WaveField:
 
 def _white(shape: tuple[int, ...], rng: np.random.Generator) -> Complex64Array:
     """Draw complex normal numbers whose real and imaginary parts have unit variance."""
-    # Drawn from a fixed set that fills the plane evenly with that density: five times as fast as the
-    # ziggurat, which took half the time of a background. A sum of some hundred such numbers has the same
-    # distribution.
+    # The numbers are drawn from a fixed set that samples the plane with that density. This is five times as
+    # fast as the ziggurat algorithm, which took half of the time of a background. A sum of some hundred such
+    # numbers has the same distribution.
     return np.asarray(_normal_plane()[rng.integers(0, NORMALS, shape, dtype=np.uint16)])
 
 
@@ -147,17 +147,18 @@ def _normal_plane() -> Complex64Array:
 ELEVATION_RAD = 0.25  # Traffic between buildings arrives from near the horizon
 FAR_M, FAR_HEIGHT_M = 60.0, 1.4  # Distance of traffic in an arm, and its height below the array
 FAR_OCTAVE = 3  # 500 Hz, the middle of the band of the feature
-# Concentration of an opening, or of an image in rough walls: some 20 degrees. With twice as much, the empty
+# Concentration of an opening, or of an image in rough walls: about 20 degrees. With twice as much, the empty
 # windows of different sites differed more than real ones do.
 OPENING_CONCENTRATION = 7.0
 # Standard deviations of the rise and fall of a distant vehicle; at two of them the level is 17 dB lower.
 FAR_WIDTH_S, FAR_AUDIBLE_S = (1.5, 4.0), 8.0
-FAR_SPAN_S, MAX_FAR = 10.0, 512  # Time to which the rate refers
+FAR_SPAN_S, MAX_FAR = 10.0, 512  # Time to which the rate refers; largest number of passages
 FAR_DRIFT_RAD = 0.15  # Change of its direction during the rise
 # Correlation time of the flicker, and the share of its variance that is common to all octaves. In real
-# recordings without a hazard the loudness of a hop has a deviation of 0.77 dB, a single band of four 0.9 to
-# 1.2 dB, and the autocorrelation of the loudness at 0.1, 0.3, 1 s is 0.63, 0.34, 0.16. With these numbers and
-# 1.1 dB it is 0.70, 0.37, 0.19 at 0.75 dB; without flicker it is 0.84, 0.75, 0.38 at 0.65 dB.
+# recordings without a hazard the loudness of a hop has a deviation of 0.77 dB, one of four bands 0.9 to 1.2
+# dB, and the autocorrelation of the loudness at 0.1, 0.3, 1 s is 0.63, 0.34, 0.16. With these numbers and a
+# flicker of 1.1 dB, simulated loudness has 0.75 dB and 0.70, 0.37, 0.19; without flicker 0.65 dB and 0.84,
+# 0.75, 0.38.
 FLICKER_S, FLICKER_SHARED = 0.12, 0.2
 FLUCTUATION_STEP_S = 0.5  # Turbulence and moving sources change a distant sound in about this time
 # Free turbulence falls with f^-2.2. The uncorrelated noise of a parked car's microphones is steeper, because
@@ -165,7 +166,7 @@ FLUCTUATION_STEP_S = 0.5  # Turbulence and moving sources change a distant sound
 # at which the array cannot resolve directions, are so coherent that vehicles are less prominent than real
 # ones.
 WIND_SLOPE, ROOF_SLOPE = -2.2, -3.7
-WIND_FLOOR_HZ, ROOF_FLOOR_HZ = 20.0, 60.0  # The density is constant below
+WIND_FLOOR_HZ, ROOF_FLOOR_HZ = 20.0, 60.0  # The density is constant below these frequencies
 NOISE_BAND_HZ = 24_000.0  # Band to which the electronic noise refers
 
 
@@ -202,7 +203,7 @@ def own_noise_density(preset: Preset, here: Ambience, frequencies_hz: FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Town:
-    """Surroundings of a site, in some directions (Q,) from the array."""
+    """Ambience of a site from several directions (Q,) around the array."""
 
     site: Site
     preset: Preset
@@ -298,7 +299,7 @@ def noise_frequencies(samples: int, sample_rate_hz: float) -> FloatArray:
 
 
 def far_passages_s(preset: Preset, duration_s: float, rng: np.random.Generator) -> FloatArray:
-    """Draw when distant vehicles are loudest: a Poisson process that also covers times outside."""
+    """Draw when distant vehicles are loudest: a Poisson process that extends beyond the recording."""
     expected = preset.far_rate * (duration_s + 2.0 * FAR_AUDIBLE_S) / FAR_SPAN_S
     return rng.uniform(-FAR_AUDIBLE_S, duration_s + FAR_AUDIBLE_S, min(int(rng.poisson(expected)), MAX_FAR))
 
@@ -319,7 +320,7 @@ class Town:
     """Surroundings of drawn walls or houses: plane waves from the sky and through the gaps."""
 
     here: Ambience
-    own: np.random.Generator  # Depends on the site alone
+    own: np.random.Generator  # Generator that depends on the site alone
     opened: FloatArray  # shape (K,): Share of each of K equal sectors from -pi on
     sky_share: tuple[float, float] = (0.3, 0.8)
     louder_db: tuple[float, float] = (0.0, 0.0)
@@ -339,7 +340,7 @@ PASSING_S, PASSING_DB = (2.0, 6.0), (-8.0, 4.0)
 def add_town(
     out: Float32Array, receiver: Receiver, preset: Preset, rng: np.random.Generator, town: Town
 ) -> None:
-    """Add the background of such a street, distant traffic included, shape (M, n)."""
+    """Add the background of a street with drawn walls or houses, with distant traffic, shape (M, n)."""
     grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
     azimuth = rng.uniform(-np.pi, np.pi, WAVES)
     elevation = np.abs(rng.normal(0.0, 0.3, WAVES))
@@ -361,6 +362,6 @@ def add_town(
 
 
 def _wander(time_s: FloatArray, every_s: float, spread_db: float, rng: np.random.Generator) -> FloatArray:
-    """Draw a level that fluctuates by a spread within a time, shape (B,)."""
+    """Draw a level that varies by `spread_db` (standard deviation) within `every_s`, shape (B,)."""
     knots = spread_db * rng.standard_normal(int(time_s[-1] / every_s) + 2)
     return np.interp(time_s / every_s, np.arange(len(knots)), knots)

@@ -20,7 +20,7 @@ from .diffraction import SPEED_OF_SOUND_MPS
 
 KNOT_SAMPLES = 128
 OVERSAMPLING = 2
-# Oversampling of the signal that is spread: linear interpolation has an error below -50 dB up to 4 kHz
+# Oversampling of the signal at the centre: linear interpolation then has an error below -50 dB up to 4 kHz
 PHASES = 4
 ROWS_AT_ONCE = 128
 
@@ -198,10 +198,10 @@ class Emission:
 class MovingSource:
     """A sound and its position."""
 
-    emission: Emission  # Its sound
+    emission: Emission  # Emitted sound
     # shape (T,): Distance ahead at the knots of `emission`, or one value for a lane.
     x_m: float | FloatArray
-    y_m: FloatArray  # shape (T,): Its lateral position there
+    y_m: FloatArray  # shape (T,): Lateral position at the same knots
     height_m: float = SOURCE_HEIGHT_M  # Above the road
 
     @property

@@ -9,7 +9,7 @@ from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 
 REFERENCE_KELVIN, TRIPLE_POINT_KELVIN = 293.15, 273.16
 STREET_KELVIN, STREET_HUMIDITY = 283.15, 70.0
-ROAD_REFLECTION = 0.9  # Pressure; dense asphalt and paving
+ROAD_REFLECTION = 0.9  # Pressure reflection factor of dense asphalt and paving
 SMALLEST_LENGTH_M = 0.1
 
 
@@ -66,7 +66,8 @@ def ground_gain(length_m: FloatArray, source_m: float, receiver_m: float) -> Flo
 
 SPEED_OF_SOUND_MPS = 343.0
 EXTERIOR_RAD = 1.5 * np.pi  # Exterior angle of a right-angled building corner
-LEAST_RAD = 1e-6  # The formula is 0 times infinity on the shadow boundary, and exact at this distance
+# On the shadow boundary the formula is 0 times infinity; at this distance from it, it is exact
+LEAST_RAD = 1e-6
 
 
 def screen_attenuation_db(detour_m: ArrayLike, frequency_hz: ArrayLike, cap_db: float = 40.0) -> FloatArray:
@@ -126,7 +127,7 @@ def edge_gain(
         terms += _transition(size) / np.tan(angle / (2.0 * n))[:, None]
     edge = -np.exp(-0.25j * np.pi) / (2.0 * n * np.sqrt(np.pi) * root) * terms
     lit = away > 0.0
-    # The detour has no effect in shadow, and exponentials are a third of the cost.
+    # In shadow the detour has no effect, so these exponentials, a third of the cost, are not computed there.
     edge[lit] *= np.exp(-1j * detour_m[lit, None] * wave)
     return np.asarray(np.abs(lit[:, None] + edge))
 

@@ -46,7 +46,8 @@ ROAD_REFLECTION = 0.9
 SCREEN_CAP_DB = 24.0
 
 EXHAUST_SHARE = 0.3  # Share of the propulsion power; the rest leaves through the engine bay
-FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])  # At 1 m, per octave and pillar
+# Level at 1 m and 70 km/h, per octave and pillar
+FLOW_AT_70_DB = np.array([70.0, 72.0, 73.0, 72.0, 70.0, 67.0, 63.0, 58.0])
 # dB per decade of speed: the power of a dipole grows with the sixth power of the flow speed
 FLOW_EXPONENT = 60.0
 # Octave of 100 Hz at 10 m/s behind a windscreen, fitted to the level of windows of DA1 and DB1: with 71 dB it
@@ -60,10 +61,10 @@ IDLE_HZ, SHIFT_UP_HZ = 26.7, 45.0
 ENGINE_WANDER, WANDER_STEP_S = 0.01, 0.5
 
 ECHO_WAVES, ECHO_ORDERS, ECHO_AT_MPS = 36, 4, 5.0
-# Images of a car in the walls beside it are at its sides. Reveals and parked cars ahead return sound that
-# goes forward, and most of the echo. Fitted to prominence and peak of the empty and hidden windows of DA1 and
-# DB1: with a share of 0.2 from around and no channel mismatch an empty street has a prominence of 1.5 (real
-# 1.16).
+# The images of a car in the walls beside it are at its sides. Reveals and parked cars ahead return sound that
+# travels forward, and contribute most of the echo. Fitted to prominence and peak of the empty and hidden
+# windows of DA1 and DB1: with a share of 0.2 from all around and no channel mismatch, an empty street has a
+# prominence of 1.5 (real 1.16).
 ECHO_RAD, ECHO_CONCENTRATION, ECHO_AROUND, ECHO_SPREAD_DB = 1.15, 9.0, 0.8, 3.0
 
 HEAD_START_S = 0.05  # Longer than any path on the vehicle

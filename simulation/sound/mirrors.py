@@ -36,11 +36,11 @@ FADE_M = 1.0
 FAINTEST = 0.03  # Amplitude relative to the strongest image, below which an image is left out
 NARROWEST_RAD = 1e-5  # Narrowest beam
 BESIDE_M = 0.01  # A corner is reachable if a point at this distance beside it is
-# Spacing of places along the path of a moving ego; gains of two places are blended. Compared with an array
-# between them (60 sources) the level is off by at most 0.8 dB, and by 0.34 dB in one of ten; with places
-# every metre by 0.34 and 0.14 dB, at twice the cost.
+# Spacing of places along the path of a moving ego; gains of two places are blended. Between them (60 sources)
+# the error of the level is at most 0.8 dB, and below 0.34 dB in nine of ten cases; with places every metre it
+# is 0.34 and 0.14 dB, at twice the cost.
 PLACES_M = 2.0
-EVERY = 4  # In knots; gains of corners change slowly
+EVERY = 4  # Interval in knots at which the gains of corners are computed, because they change slowly
 DIRECTIONS, SKY_SHARE, LOUDER_DB = 36, (0.1, 0.9), (-8.0, 2.0)
 OWN_STREET_M, ARM_M = (10.0, 60.0), (20.0, 90.0)  # Length of walls behind the ego, and along an arm
 GAP_SHARE, GAP_M = 0.3, (2.5, 6.0)  # Share of fronts in the crossing street with an opening, and its width
@@ -82,8 +82,8 @@ def drawn_fronts(site: Site) -> Fronts:
     pieces = []
     for start, way, length, kept in walls:
         at: tuple[float, ...] = (0.0, length)
-        # No opening in the ego's street: the array would see an arm through it, but the camera's plan has
-        # none.
+        # The ego's street has no openings: the array would receive sound from an arm through them, but the
+        # camera's plan has none.
         if way[0] == 0.0 and rng.random() < GAP_SHARE:
             gap = rng.uniform(2.0, length - GAP_M[1])
             at = (0.0, gap, gap + rng.uniform(*GAP_M), length)
@@ -140,7 +140,7 @@ class Images:
         return np.unique(self.number[(between & np.all(across > 0.0, axis=0))[:, 0]])
 
     def opened(self, directions: int) -> FloatArray:
-        """Return the energy that leaves the walls in each of the equal sectors of the point, shape (K,)."""
+        """Return the energy that leaves the walls in each of K equal sectors around the point, shape (K,)."""
         out, free = np.full(directions, 1e-9), ~self.bounds[:, 1, :2].any(axis=1)
         for number, ((ax, ay), (bx, by)) in zip(self.number[free], self.edges[free], strict=True):
             x, y = np.array([ax + bx, ay + by]) @ self.mirror[number, :2, :2]
@@ -211,7 +211,7 @@ def _parts(fronts: Fronts, beam: _Beam) -> Iterator[tuple[float, float, int]]:
                 across = x * along[1] - y * along[0]
                 way = (first[0] * along[1] - first[1] * along[0]) / across
                 part = (first[0] * y - first[1] * x) / across
-            # Walls before the last one are between it and its image, and carry no sound.
+            # A beam starts at its last wall: walls between the image and that wall have no effect.
             hit = (part > 0.0) & (part < 1.0) & (way > (way[beam.last] + 1e-6 if beam.last >= 0 else 0.0))
             nearest = int(np.where(hit, way, np.inf).argmin()) if hit.any() else -1
             yield beam.start_rad + low, high - low, nearest
@@ -277,7 +277,7 @@ def _add_near(
             out[span] = receiver.arrivals(source.time_s, partial(way.length_m, position))[0]
             return out
 
-        # For a standing ego the sound begins as it did when presets were fitted.
+        # For a standing ego the sound starts without a fade, as when the presets were fitted.
         add_to_all(street.static.out, emission, whole, travel, receiver, fades=not receiver.ego.stands)
 
 
@@ -286,7 +286,8 @@ def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]
     images = images_at(site, *centre_m[:2].round(3).tolist())
     place = np.stack([source.x_m, source.y_m, np.ones_like(source.x_m)])
     lit, height = images.weights(place), source.height_m
-    # At the edge of a shadow half of the amplitude remains: a quarter here, a quarter by the corner.
+    # At the shadow boundary half of the amplitude remains: a quarter from this path, a quarter round the
+    # corner.
     seen = [
         Way(lit[number, :, None] ** 2 * images.kept[number], place[:2], 0.0, images, number, height)
         for number in np.flatnonzero(lit.any(axis=1)).tolist()
@@ -309,7 +310,7 @@ def _diffracted(
         for ear, there in both:
             at, mirror = images.of(ear, centre_m), arm.mirror[there]
             unfolded = (np.linalg.inv(mirror) @ place)[:2]
-            # Images behind a face of the corner are part of the coefficient of the wedge.
+            # The coefficient of the wedge already includes images behind a face of the corner.
             open_to = reached[there] * (unfolded[0, some] > corner[0]) * (side * at[1] < across)
             key = _key(mirror @ images.mirror[ear])
             straight = lit[[one == key for one in keys]].sum(axis=0)

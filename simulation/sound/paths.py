@@ -191,7 +191,7 @@ def through_mouth(
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     (x, y), (end_x, end_y) = source_m, end_m
     run, depth = x - end_x, mouth - end_x
-    # A source that has turned in is before the mouth; its own position is used there.
+    # A source that has turned into the ego's street is in front of the mouth; its own position is used there.
     crossing = end_y + (y - end_y) * depth / np.maximum(run, depth)
     clearance = np.minimum(left - crossing, crossing - right)
     # Over a vertical edge both legs are in one unfolded plane. The shorter detour is used; both are equal
@@ -255,7 +255,7 @@ def near_facade(site: Site, source: SourceImage, source_y: FloatArray, aim_y: Fl
     mouth, left, right = site.corner_ahead_m, site.corner_left_m, -site.corner_right_m
     weight = np.ones_like(source_y)
     for plane in source.near_planes_m:
-        # A source in the ego's street would be behind that facade; it meets the mouth only.
+        # A source in the ego's street would be behind that facade, so its line meets the mouth only.
         met = aim_y + (source_y - aim_y) * (plane - mouth) / np.maximum(source.x_m - mouth, plane - mouth)
         weight *= smooth_step(np.maximum(met - left, right - met) / FACADE_END_M)
     return weight

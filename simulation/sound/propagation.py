@@ -18,14 +18,14 @@ from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls
 from .receiver import Receiver, Surroundings, add_along, add_to_all, add_turning, in_own_street
 from .static_field import StaticSources
 
-BLEND_M = 0.02  # Detour over which a line that touches a body becomes the detour round it
+BLEND_M = 0.02  # Length of the detour over which a line that touches a body becomes the path round it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenImage:
     """A source in the open, or its mirror image in a wall, and the bodies between it and the array."""
 
-    x_m: FloatArray  # shape (T,): Its position
+    x_m: FloatArray  # shape (T,): Position of the source or image
     y_m: FloatArray
     # shape (T, 8): Amplitude after the wall, per octave; 0 without a reflection.
     gain: FloatArray
@@ -54,7 +54,7 @@ class ScreenedLeg:
 
     # shape (T,): Horizontal distance from the source to that point; 0 for the straight line.
     before_m: FloatArray
-    via_x_m: FloatArray  # shape (T,): That point, or the source itself
+    via_x_m: FloatArray  # shape (T,): Position of that point, or of the source itself
     via_y_m: FloatArray
     gain: FloatArray  # shape (T, 8): Amplitude per octave; 0 if this path does not apply
 
@@ -137,9 +137,9 @@ def _beside(
     """
     image, order = path.receiver, path.source.order
     if order % 2:
-        return path  # By the wall opposite: through the mouth, as from the crossing street
+        return path  # Sound by the wall opposite arrives through the mouth, as from the crossing street
     if order:
-        # The near facade comes first, and a source in the ego's street is behind it.
+        # This path meets the near facade first, and a source in the ego's street is behind that facade.
         return replace(path, gain=path.gain * (1.0 - share)[:, None])
     across = source.y_m - image.offset_m
     above = around.receiver.above(source.height_m)

@@ -119,7 +119,7 @@ def azimuths_rad() -> FloatArray:
 
 @lru_cache(maxsize=40)  # All places of a drive
 def reached(site: Site, height_m: float, x_m: float = 0.0) -> Reached:
-    """Trace the rays of a site once, from the stop or from another place on the path to it."""
+    """Trace the rays of a site once, from the ego's stop or from another place on its way there."""
     rays = RAYS if x_m == 0.0 else RAYS // 4
     return trace(drawn_houses(site), height_m, site_generator(site.name, "rays"), rays, x_m)
 
@@ -372,7 +372,7 @@ def _lit(site: Site, source: PlacedSource, heard_x_m: FloatArray) -> FloatArray:
 
 
 def _way_m(site: Site, source: PlacedSource, ego_x_m: FloatArray) -> FloatArray:
-    """Return the horizontal path length, by the middle of the mouth for a source beside it, shape (T,)."""
+    """Return the horizontal path length, through the middle of the mouth if the source is beside it, (T,)."""
     wide = min(site.corner_left_m, site.corner_right_m)
     over = np.sign(source.y_m) * np.minimum(np.abs(source.y_m), wide)
     return np.asarray(

@@ -190,7 +190,8 @@ def add_turning(
         phases.add_to(microphone[rows.start * KNOT_SAMPLES : rows.stop * KNOT_SAMPLES], at, even)
 
 
-# Behind the corners both models of a source between them agree, so the length has little effect.
+# Length of the blend between the models of both streets; they agree behind the corners, so it has little
+# effect.
 MOUTH_BLEND_M = 0.5
 
 

@@ -22,7 +22,7 @@ class Renderer:
 
     add_source: Callable[[StreetSound, PlacedSource, np.random.Generator], None]
     town: Callable[[Receiver, Site, Ambience], Town]
-    over_roofs: bool  # Whether it carries sources outside both streets, too
+    over_roofs: bool  # Whether it also renders sources outside both streets
 
 
 # All other sites use the paths of their plan, for which a vehicle has several points and a late field.

@@ -42,7 +42,8 @@ WALL_HEIGHT_M = 3.0  # Height of the part of a wall that is near enough to matte
 HEIGHTS_M = (0.4, 2.8)
 BEHIND_M = 1.5  # Side walls scatter from this distance behind the array
 OPPOSITE_PATCH_M = 1.4
-OPPOSITE_REACH = 2.2  # Factor on the part seen through the mouth: the side walls see more of it, from aside
+# Factor on the part of the wall opposite in view of the array: the side walls see more of it, from aside
+OPPOSITE_REACH = 2.2
 SCATTER_HZ = 400.0  # Relief of a few decimetres: below this frequency a facade is smooth
 IMAGE_ORDERS = 2  # Reflections in the crossing street before a patch
 
@@ -53,9 +54,9 @@ class Patches:
 
     positions_m: FloatArray  # shape (P, 3): Middles, z above the road
     normals: FloatArray  # shape (P, 2): Towards the street
-    # shape (P,): :math:`\sqrt{w A \rho^2 / \pi}`, the length that scatters at grazing angles of 0.
+    # shape (P,): :math:`\sqrt{w A \rho^2 / \pi}`, the scattering length at normal incidence.
     strengths_m: FloatArray
-    beyond_mouth: bool  # Whether they are in the crossing street
+    beyond_mouth: bool  # Whether the patches are in the crossing street
 
 
 def scattering(preset: Preset) -> FloatArray:
@@ -224,7 +225,7 @@ class _Shown:
 
     group: Patches
     arrived: Float32Array  # shape (P, n)
-    later: IndexArray  # shape (P,): Samples by which the path to the array is longer than the direct one
+    later: IndexArray  # shape (P,): Delay of the path to the array relative to the direct one, samples
     gain: FloatArray  # shape (P, K + 1): Amplitude factor of the last leg to the array's centre
     share: FloatArray  # shape (P, K + 1): Visible share of each
 

@@ -50,7 +50,7 @@ def unit_vectors(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArr
 class StaticSources:
     """Sources that are collected and rendered together."""
 
-    out: Float32Array  # shape (M, n): Signals of the microphones, added to
+    out: Float32Array  # shape (M, n): Signals of the microphones, to which the sources are added
     sample_rate_hz: float
     _waiting: list[tuple[Float32Array, FloatArray, FloatArray]] = field(default_factory=list)
 

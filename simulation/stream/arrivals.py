@@ -30,14 +30,14 @@ SOUND_S, SOUND_MARGIN_S = (8.0, 40.0), 2.0  # The fades of an event are outside 
 class VehicleEvent:
     """One vehicle of a stream."""
 
-    flow: str  # Its flow, or "follows"
+    flow: str  # Flow of the vehicle, or "follows"
     manoeuvre: Manoeuvre
     start_s: float  # Time of the stream at which the clock of its motion is 0
-    signal: str = ""  # Its warning signal
+    signal: str = ""  # Warning signal of the vehicle
 
     @property
     def end_s(self) -> float:
-        """Time of the stream at which it is out of earshot."""
+        """Time of the stream at which the vehicle is out of earshot."""
         return self.start_s + self.manoeuvre.motion.duration_s
 
 
@@ -51,11 +51,11 @@ class SoundEvent:
 
     @property
     def end_s(self) -> float:
-        """Time of the stream at which it is over, its late sound included."""
+        """Time of the stream at which the sound is over, with its late part."""
         return self.start_s + self.sound.end_s + SOUND_MARGIN_S
 
     def at(self, array: int) -> "SoundEvent":
-        """Return it at one of the arrays."""
+        """Return the sound at one of the arrays."""
         if not self.gusty:
             return self
         return replace(self, sound=replace(self.sound, channels=self.gusty[array]))
@@ -87,7 +87,7 @@ def draw_events(settings: StreamSettings, rng: np.random.Generator) -> list[Vehi
 def _turns(settings: StreamSettings, rng: np.random.Generator) -> dict[str, FloatArray]:
     """Assign equal stretches of time to the hazards, and draw each arrival in the middle half of its own.
 
-    A drive has one hazard, shortly before the ego stops, like a recording.
+    Like a recording, a drive has one hazard, shortly before the ego stops.
     """
     per_hour, ego = settings.traffic.per_hour, settings.ego
     if not ego.stands:
@@ -111,12 +111,12 @@ def _arrival(
     names, shares = zip(*traffic.kinds.items(), strict=True)
     for arm in arms.get(flow, (None,)):
         kind = vehicle_kind(str(rng.choice(names, p=np.array(shares) / sum(shares))))
-        # A bicycle two streets away is inaudible.
+        # A bicycle two streets away is inaudible, so a light vehicle replaces it.
         heard = vehicle_kind("light") if flow in FAR and kind.name == "bicycle" else kind
         driver = draw_driver(settings.site, heard, preset, rng, arm)
         signal = _signal(traffic, heard, rng)
         if signal:
-            driver = replace(driver, reach_m=EARSHOT_M[1])  # Louder than its tyres
+            driver = replace(driver, reach_m=EARSHOT_M[1])  # A signal is louder than tyres
         leader = MANOEUVRES[flow](driver, rng)
         late_s = _later(traffic, rng) if flow == "both" and arm == RIGHT else 0.0
         yield replace(_event(flow, arrival_s + late_s, leader), signal=signal)

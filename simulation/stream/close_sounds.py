@@ -1,9 +1,9 @@
-"""Sounds at some metres, recorded by devices of any make: close passes, idling engines, single sounds.
+"""Sounds some metres away, recorded by devices of any make: close passes, idling engines, single sounds.
 
-Streets are rendered at junctions. A model that reads one microphone must also hold at other places and for
-other recorders. Here a vehicle passes or idles in the open, and any other sound is in a yard or a room, over
-noise of a drawn spectrum and through a drawn frequency response. Fluctuations, tones and their spread are
-fitted to those of real recordings (docs/evidence/foreign_sounds.md).
+Streets are rendered at junctions. A model for one microphone must also work at other places and with other
+recorders. Here a vehicle passes or idles in the open, and any other sound is in a yard or a room, over noise
+of a drawn spectrum and through a drawn frequency response. Fluctuations, tones and their spread are fitted to
+those of real recordings (docs/evidence/foreign_sounds.md).
 """
 
 from dataclasses import replace
@@ -48,7 +48,8 @@ _FLUCTUATIONS = (
 _STEADIER = 0.8  # For an idling engine
 # Firing frequency of an idling engine, Hz; depth of the level's modulation, dB, and its sharpness.
 _FIRING_HZ, _RATTLE_DB, _SHARPNESS = (15.0, 45.0), 16.0, (1.0, 4.0)
-_FOLLOWED = np.array((0.3, 0.3, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0))  # Knocking is stronger above 500 Hz
+# Share of the modulation per octave: knocking is stronger above 500 Hz
+_FOLLOWED = np.array((0.3, 0.3, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0))
 # Share of the sounds with tones of gears, motors and fans; their number, frequency in Hz and amplitude.
 _TONES = {
     "passes": (0.2, 4, (250.0, 900.0)),
@@ -57,7 +58,7 @@ _TONES = {
 }
 _TONE_GAIN = (0.02, 0.5)
 _REVERBERATION_S, _DIRECT_DB, _OUTDOORS = (0.1, 2.0), (-6.0, 15.0), 0.2
-# Above the noise in the band of the guard.
+# Signal-to-noise ratio in the band of the guard.
 _SNR_DB, BAND_HZ = (0.0, 30.0), (250.0, 2600.0)
 # Shots, barks and steps are recorded in quiet places: their pauses are silent.
 _CALM_DB = (0.0, 55.0)
@@ -140,7 +141,8 @@ def _in_the_open(
     rng: np.random.Generator,
 ) -> FloatArray:
     """Render a vehicle on a straight road, its front at the microphone at `passes_s`; speeds every 0.1 s."""
-    # An event fades in and out when it is out of earshot: it is rendered longer by the fades, and cut.
+    # An event fades in and out while it is out of earshot, so it is rendered longer by both fades and then
+    # cut.
     around = round(FADE_S / 0.1)
     speeds = np.pad(speeds_mps, around, mode="edge")
     driven = np.cumsum(np.r_[0.0, 0.05 * (speeds[1:] + speeds[:-1])])

@@ -47,11 +47,11 @@ class Motion:
     driven_m: FloatArray  # shape (N,): Distance of the front along the route
     speed_mps: FloatArray  # shape (N,)
     kind: VehicleKind
-    heading: int  # Of the lane, as in `Trajectory`
+    heading: int  # Heading of the lane, as in `Trajectory`
 
     @property
     def duration_s(self) -> float:
-        """Time of its end."""
+        """Time at which the motion ends."""
         return float(self.time_s[-1])
 
     def reaches_s(self, driven_m: float) -> float:
@@ -82,8 +82,9 @@ TURN_MPS, ARC_STEPS = 4.0, 16
 OWN_LANE_M = 1.8  # Beside the ego, whose half width is 0.9 m, as far as a side wall allows
 KERB_M = 0.95  # Half a vehicle and a hand's breadth
 BESIDE_M, SHORTEST_M = 30.0, 10.0  # Distance over which a vehicle is followed into another street
-# Out of earshot: this far below the ambience in the octaves of 125 Hz to 2 kHz, round the corner (at least 12
-# dB in deep shadow) and in the late field, which has no direction. Wind masks lower octaves.
+# A vehicle is out of earshot if its level in the octaves of 125 Hz to 2 kHz is this far below the ambience,
+# both round the corner (at least 12 dB lower in deep shadow) and in the late field, which has no direction.
+# Wind masks lower octaves.
 INAUDIBLE_DB, LATE_INAUDIBLE_DB, SHADOW_DB, HEARD_OCTAVES = 15.0, 6.0, 12.0, slice(1, 6)
 EARSHOT_M = (15.0, 80.0)
 LEFT, RIGHT = "left", "right"
@@ -97,7 +98,7 @@ class Manoeuvre:
     motion: Motion
     arrives_s: float  # Time of its clock that equals its flow's arrival time
     heard: Route | None = None  # Route of its sound, if it differs from its own
-    gap_s: float = 0.0  # Time behind the arrival that it belongs to
+    gap_s: float = 0.0  # Delay behind the arrival to which it belongs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +109,8 @@ class Driver:
     kind: VehicleKind
     arm: str
     speed_mps: float
-    braking_mps2: float  # Before the junction; 0 for none
-    reach_m: float  # The vehicle is inaudible beyond
+    braking_mps2: float  # Deceleration before the junction; 0 for none
+    reach_m: float  # Distance beyond which the vehicle is inaudible
 
     @property
     def side(self) -> float:
@@ -122,7 +123,7 @@ class Driver:
         return near if (self.arm == LEFT) is not into else far
 
     def reach_from(self, before_m: float) -> float:
-        """Return the first audible distance before a point that is `before_m` before line of sight."""
+        """Return the audible range, measured from a point that is `before_m` before line of sight."""
         return max(self.reach_m - before_m, SHORTEST_M)
 
     def entry_y_m(self) -> float:

@@ -1,7 +1,7 @@
 """A stream as blocks of samples: pieces of background and whole events, summed in order.
 
-Microphones keep their faults throughout, the background has no seam, and every event is rendered separately
-over its audible time.
+The mismatch of the microphones is constant, the background has no seam, and every event is rendered
+separately over its audible time.
 """
 
 from collections.abc import Generator, Sequence
@@ -113,7 +113,7 @@ class StreamScene:
 
     @property
     def within_s(self) -> tuple[float, float]:
-        """Rendered time of the events: all, or for a drive the time within it, often a third."""
+        """Time span in which events are rendered: unlimited, or for a drive its duration, often a third."""
         return ALWAYS_S if self.settings.ego.stands else (0.0, self.settings.duration_s)
 
 
@@ -201,7 +201,8 @@ def event_sound(
         add_sound(street, event.sound, rng)
     else:
         time, manoeuvre = np.arange(-before, blocks + 1) * knot_s, event.manoeuvre
-        # The rendered clock begins with the render; the vehicle's clock may have begun before.
+        # The rendered sound has a clock that starts at its first sample; the vehicle's clock may have started
+        # earlier.
         path = replace(manoeuvre.motion.trajectory(time + late_s, manoeuvre.heard), time_s=time)
         add_vehicle(street, path, rng)
         if event.signal:

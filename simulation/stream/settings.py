@@ -36,7 +36,7 @@ class Traffic:
     follower_share: float = 0.0  # Probability that a vehicle out of a hidden arm has a follower
     evenly: bool = False  # Whether arrivals out of hidden arms are spaced evenly rather than at random
     headway_s: tuple[float, float] = (1.5, 4.0)  # Time between a leader and its follower
-    # Maximum time between two vehicles from both sides, either first; None: normal, 0.7 s
+    # Maximum time between two vehicles from both sides, in either order; None: normally distributed, 0.7 s
     apart_s: float | None = None
     kinds: Mapping[str, float] = field(default_factory=lambda: TOWN_KINDS)  # Shares, which are normalised
     sounds: Mapping[str, float] = field(default_factory=dict)  # Other sounds per hour, by kind
@@ -93,15 +93,15 @@ TRAFFICS = {
             follower_share=0.15,
         ),
         Traffic("busy", {"left": 45, "right": 45, "both": 8, "waits": 10} | _OTHERS, follower_share=0.3),
-        # One hazard after another, for an exam of approaches: of 36 in 14.4 minutes twenty come alone, ten
-        # from both sides at once and six with a follower.
+        # One hazard after another, for an exam of approaches: of 36 arrivals in 14.4 minutes, 20 are single
+        # vehicles, 10 come from both sides at once and 6 have a follower.
         Traffic(
             "approaches",
             {"left": 125 / 3, "right": 125 / 3, "both": 125 / 3, "queue": 25} | _OTHERS,
             evenly=True,
         ),
-        # As above with realistic arrivals: independent arms, and followers at any possible distance. Of 36 in
-        # 14.4 minutes 17 come alone, 12 from both sides.
+        # Like `approaches`, with realistic arrivals: independent arms, and followers at any possible
+        # distance. Of 36 arrivals in 14.4 minutes, 17 are single vehicles and 12 come from both sides.
         Traffic("pairs", {"left": 35, "right": 35, "both": 50, "queue": 30} | _OTHERS, **_IN_PAIRS),
         Traffic("no-hazard", _OTHERS),
         # Misleading traffic: near, loud or increasingly loud vehicles that never come out of an arm.
@@ -111,7 +111,7 @@ TRAFFICS = {
             | {"stands": 30, "leaves": 50, "joins": 40},
             sounds={kind: rate for kinds, rate in _MISLEADING.items() for kind in kinds.split()},
         ),
-        # One kind of it at a time, for exams; stationary sources sound nearly all the time.
+        # Misleading traffic of one kind at a time, for exams; stationary sources sound nearly all the time.
         Traffic("receding", {"leaves": 30, "joins": 30}),
         Traffic("standing", {"stands": 60}),
         Traffic("far", {"far": 60}),
@@ -122,7 +122,8 @@ TRAFFICS = {
         Traffic("speech", {}, sounds={"voice": 150, "children": 150}),
         Traffic("music", {}, sounds={"music": 100, "tune": 100, "drums": 100}),
         Traffic("empty", {}),
-        # Training traffic in varying weather: as above, a sixth after a stop of 2 to 10 s.
+        # Training traffic in varying weather: like `pairs`, with a sixth of the vehicles after a stop of 2 to
+        # 10 s.
         Traffic("town", {"left": 30, "right": 30, "both": 40} | _STOPPING | _OTHERS, **_IN_PAIRS),
         # One kind of hazard alone, for exams.
         Traffic("stops", {"stops": 150}, evenly=True),

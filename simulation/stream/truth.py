@@ -82,7 +82,7 @@ def _add_clutter(frames: list[Frame], rng: np.random.Generator) -> None:
         width = rng.uniform(*CLUTTER_WIDTH_PX)
         height = width * rng.uniform(*CLUTTER_SHAPE)
         left = rng.uniform(0.0, camera.width_px - width)
-        # Near the horizon, where a street detector expects vehicles.
+        # False boxes are near the horizon, like the vehicles that a detector reports.
         top = rng.uniform(0.3, 0.7) * (camera.height_px - height)
         left, top, right, bottom = (round(float(v), 1) for v in (left, top, left + width, top + height))
         box = SimulatedDetection((left, top, right, bottom), round(float(rng.uniform(*CLUTTER_SCORE)), 4))
@@ -109,13 +109,13 @@ class VehicleTruth:
     x_m: FloatArray  # shape (R,): Front bumper, ahead of the array
     y_m: FloatArray  # shape (R,): Front bumper, left
     axle_rad: FloatArray  # shape (R,): Azimuth of the front axle
-    axle_m: FloatArray  # shape (R,): Its distance
+    axle_m: FloatArray  # shape (R,): Distance of the front axle
     speed_mps: FloatArray  # shape (R,)
     in_view: BoolArray  # shape (R,)
 
     @property
     def hazard(self) -> bool:
-        """Whether it comes out of a hidden arm."""
+        """Whether the vehicle comes out of a hidden arm."""
         return self.event.flow in (*HAZARDS, FOLLOWS)
 
     def time_to_visible_s(self) -> list[float | None]:
@@ -191,7 +191,7 @@ def stream_hazards(folder: Path) -> int:
 
 def describe_stream(settings: StreamSettings, vehicles: Sequence[VehicleTruth]) -> dict[str, Any]:
     """Return a stream in the form of a recording's truth: the rows of its vehicles over their times."""
-    # Readers of a recording's truth draw and score tracks; `entry_s` is the first T0 of all vehicles.
+    # Code that reads a recording's truth draws and scores tracks; `entry_s` is the first T0 of all vehicles.
     tracks = [_frames(one) for one in vehicles if len(one.time_s)]
     frames = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
     return {

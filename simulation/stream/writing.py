@@ -110,7 +110,7 @@ class Spectrogram:
 
     @property
     def times_s(self) -> FloatArray:
-        """Beginning of the lines, shape (T,)."""
+        """Start time of every line, shape (T,)."""
         step = round(LINE_S * self.sample_rate_hz) // FFT_SAMPLES * FFT_SAMPLES / self.sample_rate_hz
         return step * np.arange(len(self._lines), dtype=np.float64)
 
@@ -132,7 +132,7 @@ class WrittenStream:
     settings: StreamSettings
     vehicles: tuple[VehicleTruth, ...]
     sounds: tuple[SoundEvent, ...]
-    spectrogram: Spectrogram  # Of the microphone nearest to the array's centre
+    spectrogram: Spectrogram  # Spectrogram of the microphone nearest to the array's centre
 
 
 def write_stream(
