@@ -1,8 +1,8 @@
-r"""Curve from budget to threshold: onsets on hazard-free streams in the filter, at every threshold.
+r"""Alarm curve: onsets of the filter on hazard-free streams, at every threshold.
 
-An onset is the hop at which an alarm of either side begins. Rates differ between junctions. With the square
-:math:`\kappa` of their coefficient of variation, n onsets at J junctions leave the mean rate at K others as
-uncertain as that of one Poisson process after
+An onset is the hop at which an alarm of either side begins. Rates differ between junctions: :math:`\kappa` is
+the square of their coefficient of variation. The mean rate at K other junctions, estimated from n onsets at J
+junctions, is as uncertain as the rate of one Poisson process after
 
 .. math:: m = \Big( \frac{1}{n} + \frac{\kappa}{J} + \frac{\kappa}{K} \Big)^{-1}
 
@@ -42,10 +42,12 @@ from .heard_stream import HeardStream
 
 # With fewer expected onsets a threshold depends on chance alone.
 LEAST_ONSETS = 3.0
-# A junction counts for at most this many times the requested onsets. At 20 per hour, limits of 2, 3, 4 and 6
-# leave 22, 17, 13 and 8 % of other junctions above 20, and detect 88.8, 88.1, 87.0 and 84.9 % of approaches.
+# A junction counts for at most this many times the requested onsets. If 20 per hour are requested, limits of
+# 2, 3, 4 and 6 leave 22, 17, 13 and 8 % of other junctions above 20, and 88.8, 88.1, 87.0 and 84.9 % of
+# approaches are detected.
 LOUDEST = 3.0
-ELSEWHERE = 4  # Junctions of a route; at a single one rates differ by a factor of three either way
+# Junctions of a route; the rate at a single one may differ by a factor of three in either direction
+ELSEWHERE = 4
 UNREACHED = SequenceAlarm(1e6, 1.0)  # No alarm reaches this threshold, so it has no effect
 _LEAST, _QUANTILE = 1e-9, 0.75
 _POINTS, _MOST_SHARE = 200, 0.3  # Number of thresholds; the lowest is reached by this share of the hops
@@ -139,8 +141,8 @@ def alarm_levels(states: Iterable[WorldState], street: StreetModel | None = None
     """Return the highest threshold that raises the alarm of each side at every hop, shape (n, 2).
 
     The states must have the alarm `UNREACHED` and the parameters `street`. The value is the filter's log-odds
-    less the present rise of its threshold. It is minus infinity if there was too little sound, or if the risk
-    contradicts an alarm.
+    minus the current increase of its threshold. It is minus infinity if there was too little sound, or if the
+    risk contradicts an alarm.
     """
     denied = (street or StreetModel()).death
     levels = [[alarm_level(state, side, denied, UNREACHED) for side in SIDES] for state in states]
@@ -148,7 +150,7 @@ def alarm_levels(states: Iterable[WorldState], street: StreetModel | None = None
 
 
 def check_hours(name: str, hours: float, onsets_per_hour: float) -> None:
-    """Raise an error for fewer hours than an alarm can be set on."""
+    """Raise an error if there are too few hours to set an alarm."""
     if hours * onsets_per_hour < LEAST_ONSETS:
         wanted = f"{LEAST_ONSETS / onsets_per_hour:.2f} hours for {onsets_per_hour:g} onsets per hour"
         problem = f"expected {wanted}, got {hours:.2f}; use more sound, or allow more onsets"
@@ -156,7 +158,7 @@ def check_hours(name: str, hours: float, onsets_per_hour: float) -> None:
 
 
 def raised_at(levels: FloatArray, threshold_nats: float) -> BoolArray:
-    """Return whether any side has an alarm at every hop, shape (n,); it lasts a second unless denied."""
+    """Return whether any side is in alarm at every hop, (n,): at least 1 s unless the risk contradicts it."""
     sides = levels.reshape(len(levels), -1)
     at = np.arange(len(sides))[:, None]
     last, denied = (
@@ -169,13 +171,13 @@ def raised_at(levels: FloatArray, threshold_nats: float) -> BoolArray:
 def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool = False) -> AlarmCurve:
     r"""Count onsets and hops in alarm on hazard-free streams, at decreasing thresholds.
 
-    With `elsewhere`, the rate of a point is the smallest budget b that another junction is expected to keep
-    (A. Angelopoulos et al., "Conformal risk control", ICLR 2024, eq. 4),
+    With `elsewhere`, the rate of a point is the smallest budget b that is expected to hold at another
+    junction (A. Angelopoulos et al., "Conformal risk control", ICLR 2024, eq. 4),
 
     .. math:: \frac{1}{J + 1} \Big( L b + \sum_{j=1}^J \min(r_j, L b) \Big) \le b, \qquad L = 3
 
-    with r the most onsets per hour of junction j so far. The interval of the mean rate is extended to this
-    rate. Without `elsewhere`, it is the rate of all hours together.
+    with the maximum rate r of onsets per hour at junction j up to this threshold. The interval of the mean
+    rate is extended to this budget. Without `elsewhere`, the rate is that of all hours together.
 
     Parameters
     ----------
@@ -210,7 +212,7 @@ def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool
     intervals = [poisson_interval(*one) for one in zip(counted / fewer, hours.sum() / fewer, strict=True)]
     onsets_between = np.maximum.accumulate(intervals, axis=0).T
     onsets_between[1] = np.maximum(onsets_between[1], rates)
-    # Alarms elsewhere have the same mean length; before the first one, the length is the holding time.
+    # Alarms at other junctions have the same mean length; before the first alarm, it is the holding time.
     lasts = np.divide(share * hours.sum(), counted, np.full(share.shape, HELD_HOURS), where=counted > 0)
     share_between = np.maximum.accumulate(np.minimum(onsets_between * lasts, 1.0), axis=1)
     (low, high), (share_low, share_high) = onsets_between, share_between
@@ -228,18 +230,18 @@ def _thresholds(levels: FloatArray) -> FloatArray:
 
 
 def budgets_elsewhere(worst: FloatArray) -> FloatArray:
-    """Return the smallest budget that another junction keeps, at every threshold.
+    """Return the smallest budget that is expected to hold at another junction, at every threshold.
 
-    With the m loudest junctions cut off, it is the sum of the others over J + 1 - L (m + 1); the least
-    counts.
+    If the rates of the m loudest junctions are limited to L budgets, the budget is the sum of the other rates
+    over J + 1 - L (m + 1). The smallest such budget is returned.
 
-    Shapes: worst (junctions, thresholds), the most onsets per hour so far.
+    Shapes: worst (junctions, thresholds), the maximum rate of onsets per hour so far.
     """
     junctions = len(worst)
     fewer = np.sort(worst, axis=0)[::-1]
     others = fewer.sum(axis=0) - np.concatenate([np.zeros((1, fewer.shape[1])), np.cumsum(fewer, axis=0)])
     left = junctions + 1 - LOUDEST * np.arange(1, junctions + 2)
-    # With two junctions nothing is cut off, so only a threshold without onsets at both is kept.
+    # With two junctions no rate is limited, so the budget is finite only without onsets at both.
     least = (others[left >= 0.0] / np.maximum(left[left >= 0.0, None], _LEAST)).min(axis=0)
     # More onsets never require a smaller budget, but sums over many junctions are rounded.
     return np.asarray(np.maximum.accumulate(np.maximum(least, 0.0)))
@@ -253,7 +255,7 @@ def _variation(onsets: FloatArray, hours: FloatArray) -> float:
         return 0.0
     expected, counts, others = expected[:, known], onsets[:, known], 1.0 - hours[:, None] / hours.sum()
     excess = (np.square(counts - expected) / others - expected).sum(axis=0) / np.square(expected).sum(axis=0)
-    # A dozen junctions hardly determine it. With the upper quartile over the thresholds, the interval for one
+    # A dozen junctions determine it poorly. With the upper quartile over the thresholds, the interval for one
     # other junction contains its rate in 88 to 94 % of 1500 draws of gamma distributions; with the median, in
     # 80 to 92 %.
     return max(float(np.quantile(excess, _QUANTILE)), 0.0)

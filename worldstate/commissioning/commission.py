@@ -106,7 +106,7 @@ def heard_streams(
     jobs: int = 1,
     beside: Sequence[MicrophoneArray] = (),
 ) -> Generator[HeardStream, None, None]:
-    """Yield every stream of a plan, processed now or, with the same settings and array, before.
+    """Yield every stream of a plan; stored results of the same settings and array are reused.
 
     A newly rendered stream is also processed and stored for the arrays `beside`; a small array adds a sixth
     of the time that it takes alone.
@@ -123,7 +123,7 @@ def _heard(
     folder: Path,
     settings: StreamSettings,
 ) -> list[HeardStream]:
-    """Return the first array's processed streams, one per assumed version; store those of all arrays."""
+    """Return the streams of the first array, one per version in `believed`; store those of all arrays."""
     paths = [
         [_path(one, other, folder, settings) for other in some]
         for one, some in zip(arrays, believed, strict=True)
@@ -171,8 +171,8 @@ def learn_sequence(
     """Train a sequence model on streams, with evidence from models without the junction of the stream.
 
     `fit_windows` trains a window model on some of the streams. The evidence of a stream always comes from a
-    model that was not trained on its junction. Otherwise it would be too good, and trees would trust it too
-    much elsewhere.
+    model that was not trained on its junction. Otherwise it would be better than at new junctions, and the
+    trees would give it too much weight.
     """
     evidence, folds, fitted = dict[int, FloatArray](), _folds(streams), list[EnsembleModel]()
     for outside in folds:
@@ -292,8 +292,8 @@ def commission(
         excluded_lists=(*excluded_lists, *settings.leave_out),
         simulated=simulated,
     )
-    # The guard leaves some streets out during its training, for which two streets are too few. With recorded
-    # clips it is trained anyway, with two simulated clips per kind.
+    # The training of the guard leaves some streets out, so the two streets of `quick` are too few. With
+    # recorded clips the guard is trained anyway, with two simulated clips per kind.
     if recorded is not None or not settings.quick:
         learned("sounds near by")
         model = _with_ears(model, array, streams, recorded, settings, jobs, learned)
@@ -334,7 +334,7 @@ def _with_ears(
     jobs: int,
     learned: Callable[[str], None],
 ) -> Model:
-    """Return a model with a guard and classes of road users, trained on sounds near by and in streets."""
+    """Return a model with a guard and a road-user classifier, trained on sounds near by and in streets."""
     rate_hz: float = streams[0].hops.about["sample_rate_hz"]
     sites = tuple(dict.fromkeys(one.site for one in streams))
     close, passes = _sounds(rate_hz, sites, settings.seed, 2 if settings.quick else CLIPS_EACH, jobs)
@@ -359,7 +359,7 @@ def _sounds(
 
 
 def quiet_streams(quiet: Sequence[Path], array: MicrophoneArray, onsets_per_hour: float) -> list[HeardStream]:
-    """Process recordings without vehicles; raise an error for fewer hours than an alarm can be set on."""
+    """Process recordings without vehicles; raise an error if there are too few hours to set an alarm."""
     heard = [hear_recording(path, array) for path in quiet]
     hours = sum(len(one.hops) for one in heard) * HOP_S / SECONDS_PER_HOUR
     check_hours("quiet", hours, onsets_per_hour)
@@ -390,7 +390,7 @@ def parts_of(model: Model) -> tuple[EnsembleModel, SequenceModel]:
 def own_windows(
     array: MicrophoneArray, settings: CommissionSettings, table: FeatureTable | None
 ) -> tuple[ModelDomain, FeatureTable | None]:
-    """Return the domain of a model for an array, and the labelled windows that it may learn."""
+    """Return the domain of a model for an array, and the labelled windows for its training."""
     plan = learned_streams(settings)
     domain = domain_of(array, [plan[0].sample_rate_hz], [one.site.name for one in plan])
     domain = replace(domain, fastest_mps=max(one.ego.speed_mps for one in plan) or None)
@@ -413,12 +413,13 @@ def windows_to_learn(
 
 def fit_of(windows_of: WindowsOf) -> FitWindows:
     """Return a function from streams to a window model that is trained on them."""
-    fitted = lru_cache(maxsize=1)(window_model)  # With real windows alone it is the same for all streams
+    # With real windows alone, the model is the same for all streams
+    fitted = lru_cache(maxsize=1)(window_model)
     return lambda some: fitted(*windows_of(some))
 
 
 def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:
-    """Return the windows that may be learned, in the domain of this array; another array is an error."""
+    """Return the windows for training, in the domain of this array; raise an error for another array."""
     kept = table.select(~np.isin(table.environments, settings.leave_out))
     if kept.domain is None:
         return replace(kept, domain=domain)

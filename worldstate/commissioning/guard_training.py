@@ -1,7 +1,7 @@
 """Train a domain guard on the sound of one microphone: streets against foreign sounds and warning signals.
 
 Street sounds are recorded at junctions and, as close passes, by other recorders. A guard trained on junctions
-alone took three quarters of real passing cars for foreign.
+alone classified three quarters of real passing cars as foreign.
 """
 
 from collections.abc import Sequence
@@ -58,9 +58,10 @@ STREET = (*OF_STREETS, CLOSE)
 CALM = ("horn", "horns", "dog", "shots", "steps", "bell", "bicycle-bell", "drums", "drill", "saw")
 IDLING = ("light", "medium", "heavy", "motorcycle")
 CLIP_S = (3.0, 6.0)
-_IN_TRAFFIC, _OVER_TRAFFIC_DB = 0.8, (-15.0, 20.0)  # A warning signal sounds among vehicles
+# Share of warning signals among vehicles, and their level above these
+_IN_TRAFFIC, _OVER_TRAFFIC_DB = 0.8, (-15.0, 20.0)
 PLACES = 4  # Folds of close sounds
-CLIPS_EACH = 40  # With 30, shares of real clips differ by 0.05 between draws
+CLIPS_EACH = 40  # With 30, results on real clips differ by 0.05 between draws
 SOUND_S = 20.0
 # Ratio to the ambience in the guard's band, over the louder half of the sound, which excludes pauses.
 SNR_DB, AUDIBLE_DB = (0.0, 25.0), 0.0
@@ -68,7 +69,7 @@ SNR_DB, AUDIBLE_DB = (0.0, 25.0), 0.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundRows:
-    """Hops with the measures of the sound before them at one microphone."""
+    """Hops, each with the measures of the preceding sound at one microphone."""
 
     measures: FloatArray  # shape (n, MEASURES), or (n, MEASURES and BANDS) of road users
     # shape (n,): Kinds of the simulator; for a guard one of STREET, FOREIGN, SIGNALS, or empty
@@ -136,7 +137,7 @@ def close_rows(
 ) -> SoundRows:
     """Render clips of every kind of vehicle and sound some metres away; kinds are the simulator's.
 
-    As in a real clip, the sound begins with its first hop.
+    The sound begins with the first hop, as in a real clip.
     """
     # Rain falls on the microphones and has no position, so it is rendered at the sites. Motorcycles are drawn
     # twice, because they differ more than cars.
@@ -204,7 +205,7 @@ def event_and_ambience(
         samples = sound.shape[1] + round(lead_s * alone.sample_rate_hz)
         ambience = ambience_piece(scene, samples, rng, begins=True)[0, :samples]
         if not settings.ego.stands:
-            # The ego drives all the time; the ends of the drives show an ego at rest.
+            # The ego drives throughout, because at the end of a simulated drive it is at rest.
             speed = np.full(samples, rng.uniform(*EGO_SPEEDS_MPS))
             levels = settings.preset.ego_engine_db, settings.site.surface_db
             ambience += ego_noise(position_m[None], speed, alone.sample_rate_hz, rng, *levels)[:, 0]
@@ -242,11 +243,11 @@ FLAGGED = 0.025  # Share of hops of each label that may be flagged, on streets o
 # Shares of the total weight. All classes of a group, and all kinds of a class, have equal weight for any
 # duration of sound. Of the street weight, half is for junctions and half for close sound.
 _STREET, _FOREIGN, _SIGNALS = 0.5, 0.3, 0.2
-_FOLDS, _SITES_OF_SOUNDS = 5, 8  # Larger values of either take minutes
+_FOLDS, _SITES_OF_SOUNDS = 5, 8  # With larger values of either, training takes minutes longer
 _EVERY = 8  # Neighbouring hops share 95 % of their sound
 _FIGURES = 5  # Significant figures of coefficients, which make the file a fifth as long
-# The least threshold, in quarters of a nat, that at most 5 % of the hops of 195 CC0 recordings of buses and
-# trams exceed (5.7 % at 0.5, 4.6 % at 0.75), with guards that were not trained on the recordist. The
+# The smallest threshold, in steps of 0.25 nat, that at most 5 % of the hops of 195 CC0 recordings of buses
+# and trams exceed (5.7 % at 0.5, 4.6 % at 0.75), with guards that were not trained on the recordist. The
 # threshold from streets is lower.
 CC0_THRESHOLD = 0.75
 # Log-odds of a signal over all foreign sound that 97.5 % of the hops of simulated signals exceed (-3.85),

@@ -42,19 +42,20 @@ from worldstate.simulation.stream.writing import DrawnStream, draw_stream
 
 # Names of traffic: hazards one after another, one hazard per drive of a moving ego, and none.
 PAIRS, APPROACHES, HAZARD_FREE = "pairs", "approaches", "no-hazard"
-# Training traffic for an ego at rest, with each renderer and in varied weather: vehicles that come at every
-# junction, and at two of four junctions near or loud sources that never come.
+# Training traffic for an ego at rest, with each renderer and in varied weather: vehicles that come into view
+# at every junction, and at two of four junctions near or loud sources that never do.
 TOWN, CALM_TOWN, MISLEADING_TOWN = "town-varied", "no-hazard-varied", "misleading-varied"
 LEARNED_PRESET = "street-7"
-# In addition, half as long, the usual preset without weather: a model of one preset is worse on the other.
+# Streams with the usual preset and without weather are added, half as long, because a model trained with one
+# preset is worse with the other.
 USUAL_SHARE = 0.5
 RENDERERS = {"S": 0, "T": 500, "M": 750}  # First letter of a junction's name, and its first number
 EXAM_OTHERS = ("A911", "B911", "A912", "B912", "A913")  # Exam junctions of the other renderers
 # Seeds of training streams and exam streams, which never overlap. Every junction has its own; with one seed
 # the same drivers would come at the same times everywhere.
 LEARNED_SEED, USUAL_SEED, EXAM_SEED, SEEDS_EACH = 1_000_000, 1_099_000, 2_000_000, 1000
-# With a moving ego, a stream is many drives with a seed each. An approach is judged until six seconds after
-# its last vehicle, and a second vehicle of a queue comes four seconds after the first.
+# With a moving ego, a stream consists of many drives with one seed each. An approach is evaluated until six
+# seconds after its last vehicle, and the second vehicle of a queue comes four seconds after the first.
 DRIVES_S, DRIVES_EACH = {APPROACHES: 18.0, HAZARD_FREE: 12.0}, 1000
 MOUNTING = 2  # Number of the junction for wrong mountings
 
@@ -125,7 +126,7 @@ def quick_settings(settings: CommissionSettings) -> CommissionSettings:
 def learned_streams(settings: CommissionSettings) -> list[StreamSettings]:
     """Return the training streams: drawn junctions, none of the five named ones.
 
-    All renderers have the same number, so that none outweighs the others.
+    All renderers have the same number of junctions, so that none outweighs the others.
     """
     plans = {i: f"{'AB'[i % 2]}{101 + i // 2}" for i in range(settings.junctions)}
     approaching, quiet = settings.approach_minutes, settings.hazard_free_minutes
@@ -151,7 +152,7 @@ def _numbered(letter: str, plans: Mapping[int, str], settings: CommissionSetting
 
 
 def exam_streams(settings: CommissionSettings) -> list[StreamSettings]:
-    """Return the exam streams: twenty single vehicles and more at each of the five named junctions.
+    """Return the exam streams: twenty single vehicles, pairs and queues at each of the five named junctions.
 
     Five junctions of each other renderer are added, with a third of the time for an ego at rest.
     """
@@ -279,8 +280,8 @@ def hear_stream(
 ) -> list[HeardStream]:
     """Render a stream once for several arrays, and process it block by block with each of them.
 
-    Arrays do not affect one another. `believed` contains, for each array, the versions with which its sound
-    is processed, one result each; by default the array itself.
+    Arrays do not affect one another. `believed` contains the assumed versions of each array, such as wrong
+    mountings; its sound is processed once with each. By default it is the array itself.
     """
     stream, loudness = draw_stream(settings, *arrays), dict[int, FloatArray]()
     slices = stream.scene.microphones.slices
@@ -391,7 +392,7 @@ def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
 
 def _truth(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> tuple[HopTable, HopTable]:
     """Return one row per vehicle, and one per vehicle and tenth of a second, as in `HeardStream`."""
-    # Typed column by column: without any vehicle, rows would make columns of floats.
+    # Columns are typed one by one, because without any vehicle they would be columns of floats.
     motions = [one.event.manoeuvre for one in every]
     vehicles = HopTable(
         {

@@ -23,7 +23,7 @@ HOPS_EACH = 25
 # A kind may be a class name of guard or road users; it then becomes the first simulated kind of that class.
 _AS = {name: kind for kind, name in reversed((FOREIGN | SIGNALS | CLASS_OF).items())}
 _AS |= {"street": CLOSE, "bus": _AS["truck"]}
-_FREE = "Creative Commons 0"  # Everything that is learned from it is free, too
+_FREE = "Creative Commons 0"  # Coefficients learned from such clips alone are the project's own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class RecordedClips:
     rows: SoundRows  # Kinds of the simulator, or others from the table; sites are the recordings
     recordings: Mapping[str, int]  # Number of each kind, with its name in the table
     digest: str  # SHA-256 of the table
-    licences: tuple[str, ...]  # As stated in the table
+    licences: tuple[str, ...]  # Licences as stated in the table
 
     @property
     def told(self) -> str:
@@ -49,7 +49,7 @@ def read_recorded(folder: Path, table: Path, advance: Callable[[], object] = lam
     """Process the clips of a table with files in a folder; `advance` is called after every line.
 
     The columns are file and kind, and optionally recording (default: one per file), road_user (a class of
-    `CLASSES`, or empty) and licence. A kind that is unknown to the simulator and the guard becomes a foreign
+    `CLASSES`, or empty) and licence. A kind that neither the simulator nor the guard has becomes a foreign
     class of its own; a bus is a truck.
 
     Raises

@@ -27,12 +27,12 @@ from worldstate.simulation.stream.truth import visible_s
 from .guard_training import SoundRows, characters, event_and_ambience, fit_softmax, loudness
 from .heard_stream import junction_named
 
-# User classes of the simulator's kinds.
+# Classes of road users, by kind of the simulator.
 CLASS_OF = {
     **{"light": "car", "electric": "car", "medium": "van", "heavy": "truck", "tram": "tram"},
     **{"motorcycle": "motorcycle", "bicycle": "bicycle", "scooter": "bicycle"},
 }
-# Assumed, like those of simulated traffic, with some motorcycles and trams added.
+# Shares of the kinds, assumed like those of simulated traffic, with some motorcycles and trams added.
 _SHARES = {
     **{"light": 0.70, "electric": 0.06, "medium": 0.07, "heavy": 0.03, "tram": 0.01},
     **{"motorcycle": 0.02, "bicycle": 0.09, "scooter": 0.02},
@@ -40,16 +40,17 @@ _SHARES = {
 CLASSES = (*dict.fromkeys(CLASS_OF.values()), UNKNOWN)
 # Range of hops in the figures, seconds from line of sight; earlier hops are learned, too.
 FIRST_S, LAST_S = -3.0, 1.5
-_DRIVEN_S, _LEAD_S = 7.0, 3.0  # Time before line of sight, and of ambience before that
+_DRIVEN_S, _LEAD_S = 7.0, 3.0  # Rendered time before line of sight, and duration of the ambience before it
 # Ratio to the ambience, 250 to 2600 Hz, over one second. At 0 dB a seventh of the hops of cars are labelled
 # unknown, although their class is found as well.
 _AUDIBLE_DB = -6.0
 # Chosen on real clips of cars and trams, which are used for nothing else: their log-loss is 0.28 at this
-# strength and 0.40 at 0.003. For passes at junctions of the two renderers it is 0.59 and 0.55, 0.86 and 0.91.
+# strength and 0.40 at 0.003. For passes at junctions it is 0.59 and 0.55 with one renderer, 0.86 and 0.91
+# with the other.
 STRENGTH = 0.001
-# A recorder whose response rises or falls over the band shifts the bands along a straight line over octaves.
-# Every row is learned as it is and with two tilts of this size from end to end. A tilt of 6 dB then changes
-# no mean probability of a kind by more than 0.05 (0.14 without).
+# If the response of a recorder rises or falls over the band, the band levels change linearly over octaves.
+# Every row is used for training unchanged and with two tilts of this size from end to end. A tilt of 6 dB
+# then changes no mean probability of a kind by more than 0.05 (0.14 without).
 _TILT_DB = 21.0
 _OCTAVES = 0.5 * np.log2(np.multiply(EDGES_HZ[:-1], EDGES_HZ[1:]))
 _NATS_OF_TILT = 0.1 * np.log(10.0) * (_OCTAVES - _OCTAVES.mean()) / np.log2(EDGES_HZ[-1] / EDGES_HZ[0])
@@ -63,7 +64,7 @@ class RoadUserRows(SoundRows):
     """Hops of vehicles that pass alone."""
 
     audible: BoolArray  # shape (n,)
-    counts: BoolArray  # shape (n,): Whether it is near line of sight
+    counts: BoolArray  # shape (n,): Whether the vehicle is near line of sight
 
     @property
     def classes(self) -> IndexArray:
@@ -159,7 +160,7 @@ def fit_road_users(rows: RoadUserRows) -> RoadUserModel:
 
 
 def tilted(measures: FloatArray, tilt_db: float) -> FloatArray:
-    """Return the measures for a recorder whose response rises by this much over all bands."""
+    """Return the measures for a recorder whose response rises by `tilt_db` over all bands."""
     bands = measures[:, len(MEASURES) :] + tilt_db * _NATS_OF_TILT
     return np.column_stack([measures[:, : len(MEASURES)], bands])
 

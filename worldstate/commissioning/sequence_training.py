@@ -24,10 +24,10 @@ from .heard_stream import ROW_S, HeardStream
 
 # Hardly audible before they are visible: "hidden" and "empty" would both be wrong labels for their windows.
 SILENT_KINDS = ("bicycle", "scooter")
-# Tyres of electric cars are learned, but they are audible later than engines: an exam reports these kinds
-# separately.
+# Electric cars are used for training, but their tyres are audible later than engines, so an exam reports
+# these kinds separately.
 QUIET_KINDS = (*SILENT_KINDS, "electric")
-# Below this level a vehicle is inaudible in the background of a simulated street, some 50 dB at the array; a
+# Below this level a vehicle is inaudible in the background of a simulated street, about 50 dB at the array; a
 # stream with another background shifts the level accordingly.
 AUDIBLE_DB = 48.0
 OTHER_SIDE_S = 3.0
@@ -41,7 +41,7 @@ class StreamTruth:
     seen: BoolArray  # shape (n,): Whether any vehicle is in view
     past_db: FloatArray  # shape (n, 2): Level of the loudest vehicle that has left the view to this side
     far_db: FloatArray  # shape (n, 2): Level of the loudest that never comes into view, or has not yet
-    far_rises: BoolArray  # shape (n, 2): Whether that vehicle grows louder
+    far_rises: BoolArray  # shape (n, 2): Whether that vehicle becomes louder
     audible_db: float = AUDIBLE_DB
 
     def groups(self) -> IndexArray:
@@ -92,14 +92,14 @@ def stream_truth(heard: HeardStream) -> StreamTruth:
     return StreamTruth(coming_s, seen, past_db, far_db, rises, audible_db)
 
 
-# Few and shallow trees with a third of the inputs each: deep trees learn their renderer. Of 324 approaches in
-# streets of the first renderer, outside the training, 100 rounds of 4 leaves at a rate of 0.1 detect 70 % at
-# 30 onsets per hour; 270 rounds of 16 leaves at 0.2 detect 54 %.
+# Few and shallow trees with a third of the inputs each, because deep trees overfit to their renderer. Of 324
+# approaches in streets of the first renderer, outside the training, 100 rounds of 4 leaves at a rate of 0.1
+# detect 70 % at 30 onsets per hour; 270 rounds of 16 leaves at 0.2 detect 54 %.
 RIDGE, INPUTS_EACH = 20.0, 0.3
-# Interval of the learned hops, and least number of hops in a leaf. Neighbours share most of their sound, and
-# the training time grows with the rows. Trained on half of ten junctions and tested on the others, both ways,
-# the log-loss with every third, fifth and eighth hop, and leaves of the same duration, is 1.43, 1.40, 1.38
-# and 1.60, 1.57, 1.59.
+# Interval of the hops for training, and smallest number of hops in a leaf. Neighbours share most of their
+# sound, and the training time grows with the rows. Trained on half of ten junctions and tested on the others,
+# both ways, the log-loss with every third, fifth and eighth hop, and leaves of the same duration, is 1.43,
+# 1.40, 1.38 and 1.60, 1.57, 1.59.
 EVERY_HOPS, SMALLEST_LEAF = 5, 180
 COVERAGE = 0.9
 _FIGURES = 7  # Significant figures, which halve the length of the file; no input is more precise

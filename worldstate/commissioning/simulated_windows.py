@@ -40,24 +40,26 @@ from .heard_stream import HeardStream
 from .sequence_training import SILENT_KINDS
 
 UNUSED = ""
-# Hidden: a second or less before it comes into view. Of two vehicles, the later one is as loud within 2.5 s.
+# A window is hidden if it ends at most a second before a vehicle comes into view. If a second vehicle comes
+# within 2.5 s, it is equally loud.
 HIDDEN_S, SECOND_S = 1.0, 2.5
-# Windows of a moving ego are later by this: its released hidden windows end half a second after T0.
+# Delay of the windows of a moving ego, whose released hidden windows end half a second after T0.
 MOVING_LATE_S = 0.5
-# In view: from half a second after its arrival (the released front windows end 1.5 s after it). Farther away
-# a vehicle is hardly audible. Its windows, until a second after it has left, have no other class.
+# A window is in view from half a second after the vehicle's arrival (the released front windows end 1.5 s
+# after it). A vehicle farther away is hardly audible. Until a second after a vehicle has left, windows get no
+# other class.
 FRONT_S, NEAR_M, WINDOW_S = (0.5, 0.0), 25.0, 1.0
-# Empty: no vehicle comes within this time, and none came in the second before.
+# A window is empty if no vehicle comes within this time, and none came in the second before.
 CALM_S = 5.0
 
 
-# Least distances between windows: of hidden vehicles, which overlap, and of the others, which are most.
+# Shortest intervals between windows: hidden ones, which overlap, and the others, which are the majority.
 EVERY_S, REST_EVERY_S = 0.5, 10.0
 # Weight of a hidden window relative to a real one; all windows in view, and all empty ones, weigh as much as
 # all hidden ones. The sides of real and simulated hazards have different patterns, and this weight is a
 # compromise: at 0.15, 0.3, 0.6 and 0.9 the side is right in 77, 88, 94 and 94 % of the windows of streams,
-# and in 91, 91, 82 and 76 % of real windows at left-out junctions, with the same AUROC. If a quarter of it
-# goes to the other side, as in windows of simulated recordings, it is 77 and 94 % at 0.3.
+# and in 91, 91, 82 and 76 % of real windows at left-out junctions, with the same AUROC. If a quarter of the
+# weight is given to the other side, as in windows of simulated recordings, it is 77 and 94 % at 0.3.
 WEIGHT = 0.3
 
 
@@ -184,13 +186,13 @@ _HEAD_S, _WINDOW_S, _SCALE_PA = 0.4, 1.0, 20.0
 class OpenSource:
     """One source in the open: its position in the middle of the window, its motion and its level.
 
-    It does not depend on a site. Such windows train a model on sources whose bearing is their direction.
+    It does not depend on a site. Such windows train a model on sources whose bearing is their true direction.
     """
 
     azimuth_rad: float
     distance_m: float
     velocity_mps: tuple[float, float]
-    snr_db: float  # Above ambience, in the band of the feature
+    snr_db: float  # Level above the ambience, in the band of the feature
 
 
 def drawn_source(rng: np.random.Generator) -> OpenSource:

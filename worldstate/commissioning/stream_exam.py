@@ -1,7 +1,7 @@
 """Exam of a sequence model on streams: detected approaches, alarms per hour, calibration, times.
 
-An approach is one vehicle, two from both sides at once, or one with another behind it. The next approach is
-farther away than the longest lead time of an alarm, so the first hop in alarm is used.
+An approach is one vehicle, two from both sides at once, or one with another behind it. Approaches are further
+apart in time than the longest lead time of an alarm, so the first hop in alarm is used.
 """
 
 import math
@@ -68,7 +68,7 @@ def approaches(heard: HeardStream) -> list[StreamApproach]:
     while left:
         first = left.pop(0)
         flow, entry_s = vehicles.flow[first], vehicles.entry_s[first]
-        # A follower's leader is the only vehicle of its arm this shortly before it.
+        # The leader is the only vehicle of that arm within this time before its follower.
         second = [
             i
             for i in left
@@ -135,7 +135,7 @@ def _table(streams: Sequence[ExaminedStream]) -> ApproachTable:
 def approach_table(
     alarms: Sequence[tuple[HeardStream, BoolArray]], longest_s: float = HORIZON_S
 ) -> ApproachTable:
-    """Return the table of streams and their alarms by side, shape (n, 2)."""
+    """Return the approach table of streams, given their alarms by side, shape (n, 2)."""
     return ApproachTable(
         [told for one, on in alarms for told in alarm_outcomes(one, one.hops.time_s, on, longest_s)],
         [on for one, on in alarms if one.hazard_free],
@@ -162,7 +162,7 @@ def _by_kind(told: Sequence[ApproachOutcome]) -> Figures:
 
 
 def _worst(streams: Sequence[ExaminedStream]) -> Figures:
-    """Return the detected share at the worst junction, and the most onsets of any junction."""
+    """Return the detected share at the worst junction, and the largest number of onsets at any junction."""
     sites = np.array([one.heard.site for one in streams])
     there = [
         _table([streams[i] for i in np.flatnonzero(sites == site).tolist()]).loud().figures()
@@ -194,7 +194,7 @@ def chance_figures(within: FloatArray, coming_s: FloatArray) -> Figures:
 
 @dataclass(frozen=True, slots=True)
 class VisibleErrors:
-    """Errors of stated times, and of the best constants for the same truths.
+    """Errors of estimated times to visible, and of the best constants for the same true times.
 
     Examples
     --------
@@ -210,10 +210,11 @@ class VisibleErrors:
 
     count: int  # Number of stated times that can be checked
     intervals: int  # Number of those with an interval
-    rmse_s: float  # Error of the best value
+    rmse_s: float  # RMSE of the best value
     coverage: float  # Share of truths within the stated interval
     width_s: float
-    # Fitted to the truths themselves, so that no constant known in advance is better.
+    # Error of the constant fitted to the true times themselves: no constant that is chosen in advance is
+    # better.
     constant_rmse_s: float
 
 
@@ -263,7 +264,7 @@ def time_figures(stated: FloatArray, coming_s: FloatArray) -> Figures:
 
 
 def warned_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> FloatArray:
-    """Return the share of approaches with an alarm that long before T0 or earlier, shape (times,)."""
+    """Return the share of approaches with an alarm at least `before_s` before T0, shape (times,)."""
     leads = np.array([one.lead_s for one in _table(streams).loud().outcomes])
     return np.array([np.mean(leads > before) if leads.size else np.nan for before in before_s])
 
@@ -310,7 +311,8 @@ _OF_OTHERS = (
 def exam_figures(streams: Sequence[ExaminedStream]) -> Figures:
     """Return the figures of an exam, for a table and for JSON.
 
-    Figures of the first renderer have no prefix; some of each other renderer have its name as a prefix.
+    Figures of the first renderer have no prefix. For each other renderer, some figures are added with its
+    name as a prefix.
     """
     of = {name: [one for one in streams if one.heard.renderer == name] for name in _RENDERERS}
     first = of.pop("paths")
@@ -336,7 +338,7 @@ def with_exam(model: Model, figures: Figures) -> Model:
 
 
 def beside_reference(report: Mapping[str, object], reference: Mapping[str, float]) -> dict[str, object]:
-    """Return a report for people; figures of the 56 microphones are shown behind the model's own.
+    """Return a report for people: the model's own figures, each followed by that of the 56 microphones.
 
     Examples
     --------
@@ -382,7 +384,7 @@ def _cell(value: object, width: int) -> str:
     return f"{'-' if value is None else format(value, '.3g'):>{width}}"
 
 
-NEAR_M = 20.0  # Farther away, a vehicle in view is no louder than the street
+NEAR_M = 20.0  # Largest distance; a vehicle farther away is no louder than the street
 OFFSET_S = 0.05  # Offset between the clocks of sound and camera
 
 

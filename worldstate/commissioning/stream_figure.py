@@ -18,9 +18,9 @@ FLOWS = (
     "left", "right", "both", "queue", "follows", "waits", "turns_away", "parks", "far", "from_behind",
     "from_ahead", "stands", "leaves", "joins", "stops", "distant",
 )  # fmt: skip
-MAP_M = 60.0  # to either side
-WALLS_M = 12.0  # the ego's own street is drawn this far behind it
-COLUMNS = 1600  # of the spectrogram; the figure has fewer dots
+MAP_M = 60.0  # Extent to either side
+WALLS_M = 12.0  # The ego's own street is drawn this far behind the ego
+COLUMNS = 1600  # Columns of the spectrogram; the figure has fewer dots
 
 
 def write_stream_figure(stream: WrittenStream, path: Path) -> None:
@@ -41,7 +41,8 @@ def _draw_map(axes: "Axes", stream: WrittenStream) -> None:
         axes.plot(*np.array(line).T, color="black", linewidth=2.0)
     for one in stream.vehicles:
         for shown, colour, label in ((~one.in_view, HIDDEN, "hidden"), (one.in_view, IN_VIEW, "in view")):
-            beside = 0.15 * (one.number % 8 - 3.5)  # Side by side: vehicles of one flow use the same lane
+            # Vehicles of one flow use the same lane, so they are drawn side by side
+            beside = 0.15 * (one.number % 8 - 3.5)
             y, x = (np.where(shown, value, np.nan) for value in (one.y_m, one.x_m + beside))
             axes.plot(y, x, color=colour, linewidth=0.8, label=label)
     axes.plot(0.0, 0.0, "^", color="black", markersize=9, label="array")
