@@ -1,4 +1,4 @@
-r"""Offset of a camera's clock and yaw against the array, from the bearings of vehicles in view.
+r"""Offset of a camera's clock and yaw relative to the array, from the bearings of vehicles in view.
 
 A bearing of the sound is either that of the vehicle in view, with a normal error, or that of another source,
 at a uniform azimuth. With the position b(t) of the sound source in the boxes, clock offset d and yaw y, the
@@ -26,7 +26,7 @@ from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks
 from worldstate.operations.recordings.bearing_track import track_bearings
 from worldstate.operations.recordings.hop_table import HopTable
 
-# Search range: clocks started by hand, and brackets mounted by eye.
+# Search range, for clocks that are started by hand and brackets that are mounted by eye.
 LARGEST_OFFSET_S, LARGEST_YAW_DEG = 1.0, 15.0
 _OFFSET_STEP_S, _YAW_STEP_DEG = 0.01, 0.25
 _OFFSETS_S, _YAWS_DEG = (
@@ -37,7 +37,7 @@ _OFFSETS_S, _YAWS_DEG = (
 _STD_RAD = np.radians(4.0)
 # Share of bearings of other sources: one half at busy junctions.
 _OTHER = 0.5
-# Error at which a bearing is equally likely to be of the vehicle or of another source.
+# Error at which a bearing is equally likely to come from the vehicle and from another source.
 _OWN_RATIO = (1.0 - _OTHER) * np.pi / (_OTHER * _STD_RAD * np.sqrt(2.0 * np.pi))
 _OWN_RAD = _STD_RAD * np.sqrt(2.0 * np.log(_OWN_RATIO))
 # With fewer passes the interval would describe only one or two vehicles.
@@ -50,8 +50,8 @@ _TAPER_S = 0.2
 # After this time most of a vehicle has passed the corner, which cuts its earlier boxes.
 _WHOLE_AFTER_S = 0.5
 # Position of the sound source in its box, from the leading edge to the trailing one: between the middle and
-# the front axle with the engine. On 38 simulated passes it gives a zero alignment if there is none; a tenth
-# of a box more or less is 0.1 s of offset.
+# the front axle with the engine. On 38 simulated passes without an offset it gives an offset of zero; a tenth
+# of a box more or less changes the offset by 0.1 s.
 _HEARD_AT = 0.33
 # Shorter views cannot separate offset and yaw.
 _SHORTEST_S = 0.5
@@ -92,7 +92,7 @@ def _bearings(source: Source) -> HopTable:
 
 
 def _whole(tracks: list[BoxTrack]) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield times and azimuths of sound sources whose box is cut neither by the corner nor by the image."""
+    """Yield times and azimuths of sound sources whose box neither corner nor image border cuts."""
     for track in tracks:
         trailing_rad = track.left_rad + track.right_rad - track.leading_rad
         heard_rad = (1.0 - _HEARD_AT) * track.leading_rad + _HEARD_AT * trailing_rad
@@ -106,14 +106,14 @@ def _whole(tracks: list[BoxTrack]) -> Iterator[tuple[FloatArray, FloatArray]]:
 class Alignment:
     """Corrections of a camera's stamps and yaw, each with its 95 % interval."""
 
-    offset_s: float  # Added to the stamps of its images, to obtain the clock of the sound
+    offset_s: float  # Correction that is added to the stamps of the images, to obtain the clock of the sound
     offset_interval_s: tuple[float, float]
-    yaw_deg: float  # Added to its yaw, left positive
+    yaw_deg: float  # Correction that is added to the camera's yaw, left positive
     yaw_interval_deg: tuple[float, float]
-    passes: int  # Vehicles in view
+    passes: int  # Number of vehicles in view
     bearings: int  # Number of bearings while a vehicle was in view
-    agreeing: float  # Share of these that are more likely of the vehicle than of another source
-    median_error_deg: float  # Median error of the agreeing ones
+    agreeing: float  # Share of these bearings that are more likely from the vehicle than from another source
+    median_error_deg: float  # Median error of the agreeing bearings
 
 
 def align(passes: Sequence[HeardPass]) -> Alignment:

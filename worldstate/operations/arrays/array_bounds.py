@@ -61,7 +61,7 @@ class ArrayBounds:
         azimuth_deg : float
             One of the azimuths of `sigma_deg`.
         snr_db : float
-            Per microphone and snapshot, dB.
+            SNR per microphone and snapshot, dB.
         snapshots : int
             Number of snapshots N.
 
@@ -158,7 +158,7 @@ def array_bounds(array: MicrophoneArray, frequency_hz: float, azimuths_deg: Sequ
 
 
 def _constant_deg(array: MicrophoneArray, frequency_hz: float, azimuth_deg: float) -> float | None:
-    """Return the bound for 2 N SNR = 1; None from a million degrees on, which is a division by zero."""
+    """Return the bound for 2 N SNR = 1; None above a million degrees, a division by zero."""
     variance = cramer_rao.bearing_crb_rad2(array.positions_m, np.radians(azimuth_deg), frequency_hz, 0.5, 1)
     sigma = float(np.degrees(np.sqrt(variance)))
     return sigma if sigma < 1e6 else None

@@ -84,7 +84,7 @@ class BudgetReport:
     alpha: float  # The budget
     miss_rate: float  # beta of the statistic
     gamma: float  # The threshold
-    counted: ApproachTable  # False alarms on the recordings for which it was set
+    counted: ApproachTable  # False alarms on the recordings on which the threshold was set
     # Share of windows in alarm over recording-level folds, with thresholds from the other folds. None with a
     # single recording.
     held_out_rate: float | None
@@ -233,7 +233,7 @@ def statistic_at(stream: HopTable, prior: Sequence[float], miss_rate: float) -> 
     .. math:: s = \frac{\sum_k \pi_k \ell_k}
               {\sum_k \pi_k \ell_k + \beta\, \pi_{vis} \ell_{vis} + \pi_0 \ell_0}
 
-    It is `abduction.posterior.statistic` with the same co-evidence at every hop.
+    It is `abduction.evidence.statistic` with the same co-evidence at every hop.
 
     Shapes: prior (K + 2,).
     """

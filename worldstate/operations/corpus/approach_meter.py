@@ -138,7 +138,7 @@ def sensors_of(state: WorldState) -> str:
 
 
 def _unheard(state: WorldState) -> str | None:
-    """Return why no advisory could be raised by sound; None if one could, or if no source gives a reason."""
+    """Return the reason why sound could raise no advisory; None if it could, or if no source gives one."""
     if state.no_model is not None:
         return "no model"
     if not state.heard or any(one.share >= LEAST_HEARD for one in state.heard):
@@ -149,7 +149,7 @@ def _unheard(state: WorldState) -> str | None:
 def alarm_level(state: WorldState, side: str, denied: float, alarm: SequenceAlarm) -> float | None:
     """Return the highest threshold at which the alarm of a side would be raised; None if there is none.
 
-    It is the value that the filter compares with its threshold, less the current increase of that threshold.
+    It is the value that the filter compares with its threshold, minus the current increase of that threshold.
     It is None below the risk `denied`, or if there was too little sound.
     """
     own = (cue for cue in state.cues if cue.direction == side)

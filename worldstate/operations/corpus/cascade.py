@@ -13,10 +13,10 @@ from worldstate.frontend.spectra.stft import StreamingStft, band_bins
 from worldstate.ground import TINY
 from worldstate.ground.typing import BoolArray, FloatArray
 
-# Ten simulated minutes of a calm street (SB1, seed 5) and of a town (TA1, seed 6) with seven microphones:
-# these values keep 27 % and 56 % of the seconds, 7 of 7 and 25 of 25 onsets, and the 2 s before T0 of 9 of 9
-# and 32 of 36 vehicles. 2 dB and 0.05 keep 46 % and 68 % of the seconds, the same onsets, and 9 and 34
-# vehicles.
+# Measured on ten simulated minutes of a calm street (SB1, seed 5) and ten of a town (TA1, seed 6), with seven
+# microphones: these values keep 27 % and 56 % of the seconds, 7 of 7 and 25 of 25 onsets, and the 2 s before
+# T0 of 9 of 9 and 32 of 36 vehicles. 2 dB and 0.05 keep 46 % and 68 % of the seconds, the same onsets, and 9
+# and 34 vehicles.
 LOUDER_DB, MORE_COHERENT, USUAL = 3.0, 0.08, 20.0  # The last is a percentile of the seconds
 BEFORE_S, AFTER_S = 3, 2  # A sequence uses 3 s
 _MICROPHONES, _BAND_HZ = 4, (150.0, 1500.0)

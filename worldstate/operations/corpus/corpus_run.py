@@ -79,7 +79,7 @@ class HearPlan:
         if isinstance(model, Model):
             raise InvalidArgumentError("model: expected a file or the name of a shipped model")
         array = read_array(array) if isinstance(array, Path | str) else array
-        read_model(model, array=array)  # Refuses a wrong model before the work
+        read_model(model, array=array)  # Rejects a wrong model before the work starts
         file = file_of_model(model, array)
         # The digest depends on the microphones of an array, not on its file name.
         decides = [__version__, hops, cascade, array and (array.positions_m, array.channels), file, others]
@@ -110,7 +110,7 @@ class HearPlan:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value for the text from which the digest is computed."""
+    """Return a value in the form that enters the digest."""
     if is_dataclass(value):
         return [type(value).__name__, *(getattr(value, one.name) for one in fields(value))]
     if isinstance(value, Path):
@@ -259,7 +259,7 @@ def _hops(source: Source, meter: ApproachMeter) -> Iterator[HeardHop]:
         meter.update(state := step.state)
         levels = [alarm and alarm_level(state, side, denied, alarm) for side in SIDES]
         columns = hop_stream([step.measurement], name=meter.name).columns
-        # Without a reference, only detections show what was in view.
+        # Without a reference, vehicles in view are known from detections only.
         heard = {name: columns[name][0].tolist() for name in STREAM_COLUMNS if name != "there"}
         about = meter.name, meter.site, state.risk, state.to_json(), signature
         yield HeardHop(*about, levels[0], levels[1], **heard)

@@ -36,7 +36,7 @@ class HeardRecording:
     usable: int = 0  # Hops in which every cue is usable
     onsets: int = 0  # Number of times an advisory of any side began while none was active
     budget: float | None = None  # Onsets per hour for which the alarm is set; None if not stated
-    failure: str | None = None  # Why it failed
+    failure: str | None = None  # Reason for the failure
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +60,16 @@ class HeardApproach:
     site: str
     side: str | None
     time_s: float | None = None  # Start of the advisory; None without one
-    end_s: float | None = None  # Its last hop
+    end_s: float | None = None  # Last hop of the advisory
     chance: float | None = None  # Initial probability that a vehicle comes into view within 8 s
     expected_s: float | None = None  # Initial estimate of the time to visible
     seen: bool | None = None  # Whether a vehicle came into view; None without a look of a camera
-    seen_s: float | None = None  # Time at which it came into view
-    gone_s: float | None = None  # Last hop in which it was in view
-    lead_s: float | None = None  # From the advisory to the time at which it came into view
+    seen_s: float | None = None  # Time at which the vehicle came into view
+    gone_s: float | None = None  # Last hop in which the vehicle was in view
+    lead_s: float | None = None  # Time from the advisory until the vehicle came into view
     label: str | None = None  # Most probable class of the vehicle
     usable: bool = False  # Whether the advisory was usable at its start
-    kept: bool | None = None  # Whether a cascade keeps its start; None if not determined
+    kept: bool | None = None  # Whether a cascade keeps the start of the advisory; None if not determined
 
 
 @dataclass(frozen=True, slots=True)

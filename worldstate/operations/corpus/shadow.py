@@ -38,7 +38,7 @@ class ShadowHours:
     heard_hours: float
     unheard_hours: float
     onsets: int
-    onsets_per_hour: float | None  # Per usable hour, with its exact 95 % interval; None without any
+    onsets_per_hour: float | None  # Onsets per usable hour, with the exact 95 % interval; None without any
     low: float | None
     high: float | None
     more_hours: float | None  # Hours until the interval is below the budget; None if it never is
@@ -83,7 +83,7 @@ def _hours(name: str, count: list[int], budget: float | None) -> ShadowHours:
 
 
 def hours_to_prove(onsets: int, hours: float, budget: float) -> float | None:
-    r"""Return how many more hours bring the 95 % interval of the rate below a budget; None if none do.
+    r"""Return after how many more hours the 95 % interval of the rate is below a budget; None if never.
 
     If onsets continue at the observed rate r, the total time is the least T with
 

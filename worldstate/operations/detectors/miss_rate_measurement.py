@@ -35,7 +35,7 @@ MakeDetector = Callable[[], Detector]
 
 # Inner edges of the azimuth bins off the optical axis, which extend from 0 to the edge of the view.
 _BINS_DEG = (10.0, 20.0, 30.0)
-# Least IoU at which a reference box is found.
+# Smallest IoU at which a reference box counts as found.
 MIN_OVERLAP = 0.3
 # Half the width of a query sector for clutter, and distance between the sectors.
 _HALF_WIDTH_RAD, _SECTOR_STEP_RAD = float(np.radians(10.0)), np.radians(5.0)
@@ -43,7 +43,7 @@ _HALF_WIDTH_RAD, _SECTOR_STEP_RAD = float(np.radians(10.0)), np.radians(5.0)
 _HEALTH_FRAMES = 10
 # Initial frames of each video that are ignored, because motion detectors learn the background in them.
 _WARM_UP = 10
-# Number of frames with the same information: three, at 10 per second and an independent look every 0.3 s.
+# Frames per independent look: ten frames per second, and one independent look every 0.3 s.
 REPEATS = 3.0
 
 
@@ -103,7 +103,7 @@ def measure_absence(
     provenance: dict[str, str] | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> MissRates:
-    r"""Measure how often reference boxes are found again on degraded frames.
+    r"""Measure the miss rate of reference boxes on degraded frames.
 
     A reference box is found if a detection has :math:`IoU \ge 0.3` with it. A detection is false if it has a
     smaller IoU with all reference boxes and its middle is in none of them. A query sector without a reference

@@ -27,14 +27,15 @@ from .pass_labels import PassLabel
 
 # Columns of windows for `model features --labels` and `model fit --labels`.
 COLUMNS = ("ID", "Class", "Environment", "Recording ID", "File", "End", "T0", "T0 std")
-# A window around T0 that is off by half a second contains sound of the next class.
+# Largest standard deviation of T0 for a window: a window that is off by half a second contains sound of the
+# next class.
 SUREST_STD_S = 0.3
-# Standard deviation of T0 from a hand-over: in the demo it is 0.16 s late, which is an image and a hop.
+# Standard deviation of T0 from a hand-over. In the demo the hand-over is 0.16 s late: one image and one hop.
 HANDED_OVER_STD_S = 0.2
 _NO_FILES = {LOG_SUFFIX, *STORAGE_SUFFIXES}  # Logs have no sound, and `model features` cannot read bags
-_LOOKED = 0.9  # Least share of hops with a look of a camera, without which no window is known to be empty
-# As in streams: no vehicle comes within `CALM_S` after an empty window, or is in view from `GONE_S` before
-# it.
+_LOOKED = 0.9  # Smallest share of hops with a look of a camera; with less, no window is known to be empty
+# The rules of streams: a window is empty if no vehicle comes within `CALM_S` after it, and none is in view
+# from `GONE_S` before it on.
 CALM_S, GONE_S, NONE_EVERY_S, TOGETHER_S = 5.0, 2.0, 10.0, 2.5
 
 
@@ -109,7 +110,7 @@ def window_rows(
 ) -> list[tuple[object, ...]]:
     """Return the windows of one recording: per pass one at T0 and one in view, and windows without vehicles.
 
-    Shapes: in_view (n,), of the times, time_s (n,).
+    Shapes: in_view (n,), one value per time, time_s (n,).
     """
     rows: list[tuple[object, ...]] = []
 

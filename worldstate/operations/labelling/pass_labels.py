@@ -37,8 +37,8 @@ _LEAST_BOXES = 4
 _LEAST_TURN_RAD = math.radians(8.0)
 # A crossing vehicle keeps its distance ahead. From the first quarter of its boxes to the last, the height
 # ratio is at least 0.966 for 519 of 520 simulated passes, and at most 0.914 for 47 overtaking cars, which
-# come into view beside the ego and were taken for passes from the left arm. At independent random junctions 8
-# of 2158 passes are lost, and 5 of 88 cars remain.
+# come into view beside the ego and were classified as passes from the left arm. At independent random
+# junctions 8 of 2158 passes are lost, and 5 of 88 cars remain.
 _LEAST_GROWTH = 0.94
 # Closer to the border than this, a box ends at the image and not at the vehicle.
 _BORDER_PX = 8.0
@@ -129,13 +129,13 @@ _OTHER_BODY = (1.7, 0.7, 0.1)
 # Three pixels of a 69 degree wide image, and the detector's error at rounded corners of a body.
 _BOX_STD_RAD, _HEIGHT_STD = math.radians(0.4), 0.05
 _LEAST_EDGE_STD_RAD = math.radians(0.5)
-# In the 2 s before T0, simulated drivers deviate from their pace at T0 like white acceleration of 0.015 to
-# 0.04 m^2/s^3 in the median and 0.04 to 0.26 in the mean square. With 1 m^2/s^3 and a scale of 1 the stated
-# variance of hidden positions was four times the squared error. In a grid of densities and scales
-# (lab/NOTES.md) the values here have one of the least errors with a correct variance.
+# In the 2 s before T0, the deviation of simulated drivers from their pace at T0 equals white acceleration of
+# 0.015 to 0.04 m^2/s^3 in the median and 0.04 to 0.26 in the mean square. With 1 m^2/s^3 and a scale of 1 the
+# stated variance of hidden positions was four times the squared error. In a grid of densities and scales
+# (lab/NOTES.md) the values here have one of the smallest errors with a correct variance.
 _ACCELERATION_PSD, _MANOEUVRE_K = 0.03, 1.2
-# Longer than a pass, which is solved once at its end. If it is relinearised before the first box, the range
-# diverges and the system is indeterminate.
+# The lag is longer than a pass, which is solved once at its end. If the pass were relinearised before its
+# first box, the range would diverge and the system would be indeterminate.
 _SMOOTHING = SmoothingSettings(
     lag_s=30.0, relinearize_every=1000, acceleration_psd=_ACCELERATION_PSD, manoeuvre_k=_MANOEUVRE_K
 )
@@ -151,7 +151,7 @@ class PassLabel:
     arm: str
     label: str
     t0: FirstSight
-    track: SmoothedTrack  # From some seconds before T0 until it was last seen
+    track: SmoothedTrack  # Smoothed track from some seconds before T0 until the last box
     edge_rad: float = math.nan  # Azimuth of its corner from its first box; NaN if the image border cuts it
 
 
@@ -179,7 +179,8 @@ def _edge(tracks: Sequence[BoxTrack], arm: str) -> tuple[float, float]:
     seen = np.array([one.edge_rad for one in tracks if one.arm == arm])
     seen = seen[np.isfinite(seen)]
     if not seen.size:
-        # The image border cuts all boxes. The corner of a usual junction gives T0 a large standard deviation.
+        # The image border cuts all boxes, so the corner of a usual junction is used; T0 gets a large standard
+        # deviation.
         usual = blind_corner(arm, 1 if arm == "left" else -1)
         return usual.edge_azimuth_rad, usual.edge_std_rad
     middle = float(np.median(seen))
@@ -232,8 +233,8 @@ def _seen(azimuth_rad: float, height: float, label: str, camera_ahead_m: float) 
     if not (math.isfinite(azimuth_rad) and math.isfinite(height)):
         return []
     true_m, width_m, spread = _BODIES.get(label, _OTHER_BODY)
-    # The box has the height of the near side, and its leading edge is that of the far side: half a width
-    # each.
+    # The height of the box is that of the near side, and its leading edge that of the far side; the middle is
+    # half a width from each.
     ahead_m = true_m / height + camera_ahead_m + 0.5 * width_m
     aside_m = (ahead_m + 0.5 * width_m) * math.tan(azimuth_rad)
     range_m = math.hypot(ahead_m, aside_m)

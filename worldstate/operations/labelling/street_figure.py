@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _LANE_M = 9.0
 _BEFORE_S, _APART_M = (1.0, 2.0, 3.0), 1.3  # Rows of the drawing, far enough apart to show all bars
 _WIDEST_M, _COLUMNS = 26.0, 2
-_EVERY = 5  # Ellipses half a second apart can be distinguished
+_EVERY = 5  # Hops between ellipses; half a second apart they can be distinguished
 _FARTHEST_M = 40.0
 _DASHES = dict(zip(("left", "right"), SIDE_DASHES, strict=False))
 _EDGE = "0.35"  # Occluders are no vehicles, so they are grey

@@ -39,7 +39,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def street_pass(one: PassLabel, sound: PassSound | None = None) -> StreetPass:
-    """Return what a labelled pass contributes to its arm: edge, pace, and the sound before."""
+    """Return the contribution of a labelled pass to its arm: edge, pace, and the sound before it."""
     x, y, vx, vy = (float(np.interp(one.t0.time_s, one.track.time_s, row)) for row in one.track.states.T)
     pace_hz = abs(vy * x - y * vx) / max(x * x, 1e-9)
     # The first box may not be at the edge of this arm.
@@ -59,7 +59,7 @@ class HeardStreet:
     heard_by: str
 
     def before(self, one: PassLabel, every: Sequence[PassLabel]) -> PassSound | None:
-        """Return the sound of a pass while it was hidden; None if another one came from the other arm."""
+        """Return the sound of a pass while it was hidden; None if a vehicle came from the other arm."""
         t0_s = one.t0.time_s
         if any(other.arm != one.arm and abs(other.t0.time_s - t0_s) < _HEARD_S for other in every):
             return None

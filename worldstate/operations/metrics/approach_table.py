@@ -1,7 +1,7 @@
 """Detection rate, lead time and false-alarm rate of an alarm on approaches and hazard-free time.
 
 All onsets and leads are computed here. A study makes one outcome per approach, keeps the alarm of each
-hazard-free stream, and computes the figures from the table of both:
+hazard-free stream, and computes the figures from a table of both:
 
 >>> calm = np.zeros(36_000, bool)
 >>> calm[100:140] = True
@@ -117,10 +117,10 @@ class ApproachOutcome:
     (True, False)
     """
 
-    lead_s: float  # From the first alarm within the longest lead to T0; 0 if missed
-    onsets: int = 0  # Within the longest lead before T0
-    onsets_earlier: int = 0  # Before those
-    onsets_after: int = 0  # In the 6 s after the last T0 (streams only)
+    lead_s: float  # Time from the first alarm within the longest lead to T0; 0 if missed
+    onsets: int = 0  # Onsets within the longest lead before T0
+    onsets_earlier: int = 0  # Onsets before the longest lead
+    onsets_after: int = 0  # Onsets in the 6 s after the last T0 (streams only)
     # Whether the side of the first vehicle, the other side, and the sides of all vehicles were in alarm, each
     # within the longest lead before its T0 (streams only).
     own_side: bool = False
@@ -171,7 +171,7 @@ HORIZON_S = COMING_S[-1]  # Horizon of the risk: earlier alarms belong to other 
 def hop_outcome(
     approach: StreamApproach, time_s: FloatArray, raised: BoolArray, longest_s: float = HORIZON_S
 ) -> ApproachOutcome:
-    """Return the outcome of one approach in a stream: time_s (n,), alarm of either side (n, 2).
+    """Return the outcome of one approach in a stream, from time_s (n,) and the alarms of both sides (n, 2).
 
     Alarms more than `longest_s` before T0 are ignored.
 
@@ -249,14 +249,14 @@ class ApproachTable:
         }
 
     def standing(self) -> Figures:
-        """Return how often an alarm is active in the last second, and in the last hop, before T0."""
+        """Return the share of approaches in alarm in the last second, and in the last hop, before T0."""
         return {
             "advised_last_second": mean_of([one.last_second for one in self.outcomes]),
             "advised_at_t0": mean_of([one.at_t0 for one in self.outcomes]),
         }
 
     def sides(self) -> Figures:
-        """Return how often single vehicles are announced from the other side, and pairs on both sides."""
+        """Return the shares of singles announced from the other side, and of pairs on both sides."""
         singles, both = (self.of_flow(flow).outcomes for flow in ("single", "both"))
         gaps_s = (one.approach.entries_s[-1] - one.approach.entries_s[0] for one in both)
         near = [one.every_side for one, gap_s in zip(both, gaps_s, strict=True) if gap_s < NEAR_S]

@@ -17,7 +17,7 @@ from .hop_table import HopTable
 
 # Number of bins, spread evenly over the band, whose covariance is decomposed to count sources.
 _BINS = 12
-_FEWEST_FRAMES = 10  # Least number for a meaningful covariance
+_FEWEST_FRAMES = 10  # Fewest frames for a meaningful covariance
 
 
 # Columns of the text table: middle of the sound from which the bearing is estimated; azimuth, left positive;

@@ -25,7 +25,7 @@ from worldstate.operations import figure_style as style
 _SIGNIFICANT = 4.0
 # Crystals are off by about as much; a smaller error changes neither bearing nor level.
 _TOLERATED = 1e-5
-# Other faults that each fault explains: they may be reported before it, or now and then.
+# Other faults that each fault explains: they may be reported before it, or in some hops.
 _EXPLAINS = {
     Fault.GUSTS: {Fault.NOISY, Fault.INTERMITTENT, Fault.DEAD, Fault.DELAY, Fault.DRIFT},
     Fault.SWAPPED: {Fault.NOISY},
@@ -35,7 +35,8 @@ _EXPLAINS = {
 # Each of these faults also misplaces the waves of other channels. The one seen in most hops is the cause, and
 # the remaining faults show after it is fixed.
 _MISPLACED = frozenset({Fault.SWAPPED, Fault.DELAY, Fault.DRIFT})
-# The position of a channel with one of these faults cannot be judged, because no wave reaches it in order.
+# The position of a channel with one of these faults cannot be checked, because it does not record waves
+# correctly.
 _DEAF = frozenset({Fault.DEAD, Fault.INTERMITTENT, Fault.NOISY, Fault.INVERTED, Fault.DELAY, Fault.DRIFT})
 # Possible causes if the whole array is unusable.
 _CAUSES = {
@@ -69,7 +70,7 @@ class ChannelVerdict:
     True
     """
 
-    channel: int  # From 0
+    channel: int  # Channel number, from 0
     fault: Annotated[Fault, Via(str, str, Fault)]
     share: float  # Share of the hops in which it was detected
     first_s: float  # End of the first of these hops, seconds
@@ -131,14 +132,14 @@ class RecordingHealth:
     True
     """
 
-    verdicts: tuple[ChannelVerdict, ...]  # By channel; empty without a fault
+    verdicts: tuple[ChannelVerdict, ...]  # Faults by channel; empty without a fault
     dropouts: tuple[Dropout, ...]  # The first hundred
     n_dropouts: int  # All of them
     n_hops: int  # Hops processed
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
-    sample_rate: RateEstimate | None = None  # Measured with another clock
+    sample_rate: RateEstimate | None = None  # Sample rate measured with another clock
     positions: PositionVerdict = NOTHING_AGAINST
-    unheard: str | None = None  # Why the array is unusable in most hops
+    unheard: str | None = None  # Reason why the array is unusable in most hops
 
     @property
     def is_healthy(self) -> bool:
@@ -196,7 +197,7 @@ class HealthLog:
         for fault in health.faults:
             key = fault.channel, fault.fault
             before = self._seen.get(key) or ChannelVerdict(*key, 0.0, seconds(frame.stamp_ns), fault.value)
-            # Shares are hops until the summary divides them.
+            # The shares are numbers of hops, which the summary divides.
             newest: dict[str, Any] = {"value": fault.value, "looks_like": fault.looks_like, "std": fault.std}
             self._seen[key] = replace(before, share=1.0 + before.share, **newest)
 
@@ -223,7 +224,7 @@ class HealthLog:
 
 
 def _one_cause(verdicts: list[ChannelVerdict]) -> list[ChannelVerdict]:
-    """Keep, of misplaced channels, those with the most frequent fault, in at least half as many hops."""
+    """Keep, of misplaced channels, those with the main fault and at least half of its share of hops."""
     misplaced = [verdict for verdict in verdicts if verdict.fault in _MISPLACED]
     if any(verdict.fault is Fault.DRIFT for verdict in misplaced):
         # A drift begins as a delay.

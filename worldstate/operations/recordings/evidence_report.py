@@ -54,9 +54,10 @@ class ToldAdvisory:
 
 
 def told_advisories(states: Iterable[WorldState], side: str | None = None) -> tuple[list[ToldAdvisory], int]:
-    """Return all advisories, or those of one side, by onset, and the first onset or time of highest risk.
+    """Return the advisories (all, or of one side) by onset, and the first onset.
 
-    If the first advisory began before the first snapshot, the time of that snapshot is returned.
+    Without an advisory, the second value is the time of the highest risk. If the first advisory began before
+    the first snapshot, it is the time of that snapshot.
     """
     last_ns: dict[tuple[int, str], int] = {}
     highest, riskiest_ns, first_ns = -1.0, 0, None
@@ -93,7 +94,7 @@ class SideEvidenceReport:
 
     @property
     def standing(self) -> Standing:
-        """Whether the advisory is raised or held now, or why there is none."""
+        """State of the advisory now: raised, held, or the reason for none."""
         evidence = self.cue.evidence
         above = evidence is not None and evidence.compared_nats >= evidence.threshold_nats
         if self.cue.advisory is None:

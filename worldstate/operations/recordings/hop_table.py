@@ -22,7 +22,7 @@ from worldstate.operations.metrics.approach_table import SLACK_S
 MAX_BYTES = 512 << 20
 MAX_RECORDINGS = 100_000
 MAX_HEAD_BYTES = 64 << 20
-# Files of other versions are caches of other code: they are refused, and made again if possible.
+# Files of other versions were written by other code: they are refused, and rebuilt if possible.
 VERSION = 3
 
 HOP_S = 0.1
@@ -32,11 +32,13 @@ STREAM_COLUMNS = (
     "time_s",  # End of each window, seconds from the start
     "log_likelihoods",  # shape (n, K + 2): for hidden_1 .. hidden_K, visible, none; nats
     "answer",  # 0 unqueried, 1 absent, 2 present
-    "miss_rate",  # Of the searched channel; without one, miss rate 1 and clutter rate 0
+    "miss_rate",  # Rates of the searched channel; without one, miss rate 1 and clutter rate 0
     "clutter_rate",
     "approach",  # 1/TTA over its standard deviation; NaN if unusable
     "seen",  # Whether a moving object was detected anywhere
-    "there",  # Whether one was in view by the reference, if there is one: a degraded camera may miss it
+    # Whether a moving object was in view according to the reference, if there is one; a degraded camera may
+    # miss it
+    "there",
 )
 
 

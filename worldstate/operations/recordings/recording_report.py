@@ -40,7 +40,7 @@ class WarningSummary:
 
 
 def calibration_words(uncalibrated: int, hops: int) -> str:
-    """Return in words in how many hops the cues met a false-alarm budget.
+    """Describe in words in how many hops the cues met a false-alarm budget.
 
     Examples
     --------
@@ -61,7 +61,7 @@ class WarningMeter:
     states: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    peak_risk: float | None = None  # None before the first state with a risk
+    peak_risk: float | None = None  # Largest risk so far; None before the first state with a risk
     uncalibrated: int = 0  # Number of states without a budget
     unusable: int = 0  # Number of states with a cue that is not usable
     reasons: Counter[str] = field(default_factory=Counter)  # Number of states by reason
@@ -259,7 +259,7 @@ def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehic
         return f"no vehicle came into sight{told}"
     sentences, before_s = [], dict[str, float]()
     for first_s, last_s, side in came:
-        # An earlier announcement belongs to the vehicle before, and ended with its hand-over.
+        # An earlier announcement belongs to the previous vehicle and ended with its hand-over.
         own_s = [time_s for time_s in onsets.get(side, ()) if time_s > before_s.get(side, -math.inf)]
         sentences.append(f"{vehicle} from the {side} was {_announced(own_s, first_s, last_s)}")
         before_s[side] = first_s

@@ -110,11 +110,11 @@ def calibrate_passes(
     # measured on the training set. The first was trained on fewer junctions, without this one (leave one
     # junction out); its threshold is too conservative. The second was also trained on this junction (leave
     # recordings out); its threshold is too bold. The mean of the two thresholds is used. It is not a mean of
-    # log-odds, in which one empty window with a confident classifier of a single junction would dominate.
-    # The threshold of a level is the mean over its passes, because the choice of a street's ten windows
-    # changes the few scores that determine gamma. The risk map is that of the boldest level: statistics of
-    # windows that are compared with their site have the same meaning at other sites, but those of a
-    # classifier from too few junctions have not.
+    # log-odds, in which one empty window with a confident classifier of a single junction would dominate. The
+    # threshold of a level is the mean over its passes, because the choice of a street's ten windows changes
+    # the few scores that determine gamma. The risk map is that of the boldest level: statistics of windows
+    # that are compared with their site have the same meaning at other sites, which is not true of a
+    # classifier from too few junctions.
     if not levels or not all(levels):
         raise InvalidArgumentError("levels: expected at least one pass each")
     gammas = [
@@ -130,7 +130,7 @@ def calibrate_passes(
 
 
 def _gamma(score: FloatArray, alpha: float) -> float:
-    # No score is below 0. If all windows may be in alarm, the threshold is the least float, which would
+    # No score is below 0. If all windows may be in alarm, the threshold is the lowest float, which would
     # dominate a mean.
     return max(neyman_pearson_threshold(list(score[:, None]), alpha), 0.0)
 
@@ -196,7 +196,7 @@ def asked_on_streams(
     """Return `asked_while_listening` for several random streams."""
     # With one random stream, a standing ego at junctions left out had TPR 0.645 at a false-positive rate of
     # 0.029, with five 0.660 at 0.025: the choice of a street's ten windows changes single scores, and gamma
-    # is one.
+    # is one of them.
     return [asked_while_listening(table, one) for one in rng.spawn(STREAMS)]
 
 
@@ -323,7 +323,7 @@ def trained_ensemble(
     windows = replace(inputs, features=inputs.features[:, :N_FEATURES])
     heard = learned_while_listening(windows, np.random.default_rng(_HEARD_SEED), or_nothing=True)
     classifier = SiteEnsembleClassifier(_recipes(inputs), simulated)
-    # Products of a few thousand windows: with two threads a fit takes three times as long.
+    # The matrix products have only a few thousand rows: with two threads a fit takes three times as long.
     with one_blas_thread():
         return classifier.fit(inputs.features, inputs.labels, inputs.environments, heard)
 
