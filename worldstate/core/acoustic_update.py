@@ -37,7 +37,7 @@ def acoustic_update(memory: Memory, measurement: Measurement, weight: float, sit
     silent = isinstance(bearing, NotUsable) and isinstance(approach, NotUsable)
     if weight <= 0.0 or silent or not len(rows):
         return
-    # P(this entity is the source of this window's sound)
+    # `sounding` is P(an entity is the source of this window's sound).
     visible = memory.belief.joint.explanations[1]
     sounding = np.where(tracks.seen[rows], visible, 1.0) * tracks.existence[rows]
     motion = MotionBelief(tracks.mean[rows], tracks.covariance[rows])
@@ -78,7 +78,7 @@ def association_probability(
 
 
 def _path_in_view(bearing: Bearing, site: SiteGeometry) -> tuple[tuple[float], tuple[float]]:
-    r"""Return standard deviation and prior path probability of a peak of an entity in line of sight.
+    r"""Return the deviation of a peak of an entity in line of sight, and the prior of its own path.
 
     The deviation of a measured peak includes the chance p that the peak belongs to another source:
 

@@ -128,7 +128,8 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> tuple[Event, ...]:
     """Merge two sound-only entities if two vehicles are unlikely; return the events."""
     tracks, heard = memory.tracks, _heard_rows(memory.tracks)
     least = site.street.birth * min((tracks.existence[i] for i in heard), default=0.0)
-    # Given the less likely one, the other one is too unlikely to be born.
+    # If P(both) is lower, the second vehicle would be too unlikely to be born, given the less likely of the
+    # two.
     if len(heard) < 2 or memory.sides.both >= least:
         return ()
     age = [(-tracks.existence[i], tracks.created_ns[i], tracks.id[i]) for i in heard]
@@ -154,7 +155,8 @@ MOST_EVENTS = MOST_BOXES
 
 def published(tracks: Tracks, street: StreetModel) -> Tracks:
     """Return the tracks that a snapshot lists."""
-    # A refuted claim is kept while it is repeated; otherwise its next repetition would be believed again.
+    # A refuted message is kept while it is repeated; otherwise its next repetition would count as new
+    # evidence.
     refuted = tracks.placed & (tracks.existence < street.death)
     return tracks.taken(~refuted) if True in refuted else tracks
 
@@ -189,8 +191,8 @@ def after_look(
     `emerged` maps rows that come into view to the chance that the detection belongs to them.
     """
     tracks, sides, least = memory.tracks, memory.tracks.side.tolist(), site.street.unheard
-    # The detection determines the side, since the belief may have been on another one. Of two, the likelier
-    # one.
+    # The detection determines the side, since the belief may have been on another one. Of two entities, the
+    # likelier one is used.
     residuals = [(max(least, 1.0 - chance), sides[i]) for i, chance in emerged.items()]
     handed_over = {side: residual for residual, side in sorted(residuals, reverse=True)}
     # A moving vehicle that is first seen near an edge came past this edge unnoticed.

@@ -1,4 +1,4 @@
-r"""Tests by betting: alarm budget and published chances against the later detections of a camera.
+r"""Betting tests of the alarm budget and the published chances against later detections of a camera.
 
 Each test has e-values: ratios of an alternative's likelihood to the greatest likelihood that the claim
 allows. While the claim holds, their mean is at most one. They restart at a rate :math:`\eta` of the observed
@@ -6,7 +6,7 @@ time,
 
 .. math:: M \leftarrow (1 - \eta\, dt)\, M\, e + \eta\, dt,
 
-so that hours of correct values do not hide a new error. M less :math:`\eta t` is a supermartingale with a
+so that hours of correct values do not hide a new error. M minus :math:`\eta t` is a supermartingale with a
 mean of at most one: in any time T, P(M reaches b) is at most :math:`(1 + \eta T) / b` (Ville).
 
 Sources: Shafer, "Testing by betting", J. R. Statist. Soc. A 184, 2021; Shin, Ramdas, Rinaldo, "E-detectors",
@@ -32,13 +32,14 @@ SLACK_NS = nanoseconds(0.05 * HOP_S)  # Tolerance for rounded stamps
 # An alarm is held for a second; an alarm after that is a new onset.
 ENDS_NS = nanoseconds(HELD_HOPS * HOP_S) + SLACK_NS
 _BEGUN_ANEW_HZ = 1.0 / (6.0 * SECONDS_PER_HOUR)
-# By (1 + eta T) / b, a test reaches this with a probability of at most 0.025 in 24 hours.
+# According to (1 + eta T) / b, a test reaches this with a probability of at most 0.025 in 24 hours.
 BROKEN = 200.0
 IN_DOUBT = 0.1 * BROKEN
 # Onsets come in clusters of up to this size. With a root of this order, the mean of a Poisson ratio is still
 # at most one for clusters at random times.
 CLUSTER = 2.0
-RATES = (2.0, 10.0)  # Alternatives in budgets: detectable within two hours, and within minutes
+# Alternative rates in budgets: the first is detectable within two hours, the second within minutes
+RATES = (2.0, 10.0)
 # A chance is accepted if the log-odds of the observed share differ from its own by less than this; the
 # alternatives differ by twice as much. Streets differ by a factor of three either way (1.1 nats); the filter
 # learns 0.5 nats of this from the traffic.

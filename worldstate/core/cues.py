@@ -33,7 +33,7 @@ _Times: TypeAlias = tuple[dict[str, float] | None, tuple[float, float, float] | 
 
 @dataclass(frozen=True, slots=True)
 class SideAdvisory:
-    """Advisory of a side: when it ends without news, and whether it only continues from before."""
+    """Advisory of a side, and its end if no new evidence arrives."""
 
     ends_ns: int
     held: bool = False  # The log-odds are below the threshold now
@@ -50,7 +50,8 @@ def note_source(memory: Memory, measurement: Measurement, model: FilterModel) ->
     memory.sources[source] = SourceState(stamp_ns, fault, heard, since_ns)
     if not measurement.heard.usable:
         return
-    # The paper's statistic: the policy's own prior, without memory. Other sets of sides have a uniform prior.
+    # The paper's statistic uses the policy's own prior and no memory. Other sets of sides have a uniform
+    # prior.
     prior, explanations = model.policy.reference_prior, len(measurement.signature.directions) + 2
     usual = prior if len(prior) == explanations else [1.0 / explanations] * explanations
     found = posterior_of(tuple(map(math.log, usual)), measurement.signature, measurement.co_evidence)
@@ -179,7 +180,7 @@ class SideAlarms:
         # The distance and speed of an announced vehicle are more accurate than the sound.
         if track is not None and track.place is not None:
             interval_s = time_to_visible(track.place, site.sides[track.side], site)[1] or interval_s
-        named = memory.last.named  # Empty before the first window
+        named = memory.last.named  # No sides before the first window
         is_named = told is not None or not named or site.sides[k].label in named
         since_ns, entity_id = memory.history[k].advised_ns, None if track is None else track.id
         advisory = held = None
@@ -209,7 +210,7 @@ class SideAlarms:
         )
 
     def _why_none(self, side: int) -> str | None:
-        """Return why a side of high risk has no advisory; None if a vehicle is unlikely to come."""
+        """Return the reason for no advisory at a high risk; None if a vehicle is unlikely to come."""
         belief = self.memory.belief
         if self.sides.risks[side] <= self.model.site.street.birth:
             return None
@@ -230,7 +231,7 @@ class SideAlarms:
         return alarm.promise.alpha if evidence.hypothesis == "coming" and alarm and alarm.promise else None
 
     def _times(self) -> list[_Times]:
-        """Return the chances of coming into view by horizon, and the time until an expected vehicle does."""
+        """Return the chances by horizon, and the time to visible of an expected vehicle."""
         belief = self.memory.belief
         if not belief.has_times:
             return [(None, None)] * len(self.advisories)

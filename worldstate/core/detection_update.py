@@ -46,8 +46,8 @@ from .memory import FORGOTTEN_NS, NEWS_HOLDS_NS, CountedLook, Memory
 from .site_model import FilterModel
 from .street_belief import alerted
 
-# Deviation of (theta_dot rad/s, rho 1/s) at the first box. A car at 50 km/h in 15 m has 0.9 rad/s, which
-# is two deviations; a parked car has none.
+# Deviation of (theta_dot rad/s, rho 1/s) at the first box. A car at 50 km/h and a distance of 15 m has 0.9
+# rad/s, which is two deviations; a parked car has no motion.
 _NEW_RATE_STD, _PARKED_RATE_STD = 0.5, LEAST_STD
 
 

@@ -40,7 +40,7 @@ class WorldFilter:
     policy : CueingPolicy
         Threshold and risk map; a model file contains one.
     settings : FilterSettings
-        Windows, births and deaths.
+        Settings of the belief.
     start_ns : int
         Time of the first belief, ns, on the clock of the measurements.
     memory : Memory, optional
@@ -176,7 +176,7 @@ class WorldFilter:
         InvalidArgumentError
             If the measurement has no direction of the context. Its values are checked when it is built.
         """
-        # First, so that a refused measurement leaves the filter unchanged.
+        # Checked first, so that a refused measurement leaves the filter unchanged.
         measurement, left_out = _fitting(measurement, self.context)
         lag = self._lag.add(measurement, self.stamp_ns, self._step)
         if lag is None:

@@ -38,13 +38,13 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FixedLag:
-    """Measurements of the lag, and the memory after the last of them."""
+    """Measurements within the lag, and the memory after the last of them."""
 
     latest: Memory
     arrivals: tuple[Arrival, ...] = ()
     delivery: Delivery = field(default_factory=Delivery)
     late_since_ns: int | None = None  # First stamp of a run of measurements that were all too late
-    held: Timed | None = None  # Ahead of all others, until another one confirms its stamp
+    held: Timed | None = None  # Measurement ahead of all others, until another one confirms its stamp
 
     @property
     def base(self) -> Memory:
@@ -111,7 +111,7 @@ class FixedLag:
 
 
 _STAMP_NS = attrgetter("measurement.stamp_ns")
-# The key of a delivery; a source takes one measurement at a time.
+# The key of a delivery; a source has at most one measurement per stamp.
 _delivery = attrgetter("stamp_ns", "source")
 
 

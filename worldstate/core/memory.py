@@ -22,7 +22,7 @@ from .street_belief import StreetBelief
 NEWS_HOLDS_NS = nanoseconds(1.0)
 # Names come and go; without a limit a checkpoint would keep all of them.
 FORGOTTEN_NS = nanoseconds(SECONDS_PER_HOUR)
-# Per image, and for the events of a step. A crowded street has some forty; with 600 a step took 0.3 s.
+# Limit per image, and for the events of a step. A crowded street has some forty; with 600 a step took 0.3 s.
 MOST_BOXES = 64
 ValueT = TypeVar("ValueT")
 
@@ -62,7 +62,8 @@ class Instant:
     """Result of one window alone, at the policy's reference prior."""
 
     statistic: Probability | None = None  # P(hidden), all directions together
-    log_lambda: float | None = None  # None for an infinite ratio, which JSON cannot represent
+    # Log of the likelihood ratio; None if infinite, which JSON cannot represent
+    log_lambda: float | None = None
 
 
 @dataclass
@@ -74,8 +75,8 @@ class LastSaid:
     instant: Instant = Instant()  # Result of the last window
     bearing: Bearing | None = None
     domain: DomainVerdict | None = None
-    named: tuple[str, ...] = ()  # Sides that its evidence distinguishes
-    no_sequence: NotUsable | None = None  # Why it gave no times to visible
+    named: tuple[str, ...] = ()  # Sides that the evidence of this window distinguishes
+    no_sequence: NotUsable | None = None  # Reason for missing times to visible
     events: tuple[Event, ...] = ()
 
 
@@ -85,7 +86,7 @@ class Counts:
 
     measurements: Count = 0
     sighted: Count = 0  # Entities born in view
-    left_out: Count = 0  # Entities beyond the limit
+    left_out: Count = 0  # Entities left out, beyond the limit
 
 
 @dataclass(eq=False)
@@ -107,7 +108,8 @@ class Memory:
     looks: dict[str, CountedLook] = field(default_factory=dict)  # Last look by sensor
     relations: tuple[Relation, ...] = ()  # Relations with their intervals
     ego: EgoBelief | None = None  # Pose from odometry; None without odometry
-    sounds: tuple[SoundTrack, ...] = field(default=(), metadata=ADDED)  # Used if no model reads the sound
+    # Tracks of sound, used if no model reads the sound
+    sounds: tuple[SoundTrack, ...] = field(default=(), metadata=ADDED)
 
     @property
     def sides(self) -> SideBelief:

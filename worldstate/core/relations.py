@@ -20,10 +20,10 @@ from .site_model import FilterModel
 from .street_belief import StreetBelief
 
 _HOLDS = 0.5  # A relation holds from this probability
-_KEPT_NS = nanoseconds(LONGEST_S)  # How long an ended relation is kept
+_KEPT_NS = nanoseconds(LONGEST_S)  # Time for which an ended relation is kept
 # Half the width of a lane in town; below walking pace the heading does not indicate the lane.
 _HALF_LANE_M, _LEAST_SPEED_MPS = 1.6, 1.5
-_ALIKE = 0.5  # Cosine of headings in one lane: within 60 degrees
+_ALIKE = 0.5  # Smallest cosine between two headings in one lane: 60 degrees
 _LEAST = 0.05  # Less likely relations are left out
 Edge: TypeAlias = tuple[str, str, str, float]  # Source, target, kind and P(it holds)
 

@@ -80,7 +80,7 @@ def forecasts(tracks: Tracks, site: SiteGeometry) -> list[Forecast]:
 # Deviation of log r, 25 % of the range. The priors have 0.6; a range with a larger deviation was not
 # measured.
 _KNOWN_LOG_RANGE_STD = 0.25
-NINE_OF_TEN = NormalDist().inv_cdf(1.0 - TAIL)  # Standard deviations to either side
+NINE_OF_TEN = NormalDist().inv_cdf(1.0 - TAIL)  # Half width of a 90 % interval, standard deviations
 _UPPER = [AZIMUTH, AZIMUTH, AZIMUTH_RATE], [AZIMUTH, AZIMUTH_RATE, AZIMUTH_RATE]
 
 

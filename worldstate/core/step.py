@@ -112,7 +112,7 @@ def _perceive(memory: Memory, measurement: Timed, start_ns: int, model: FilterMo
 def _hear_and_look(memory: Memory, measurement: Measurement, start_ns: int, model: FilterModel) -> None:
     last, site = memory.sources.get(measurement.source), model.site
     since_ns = measurement.stamp_ns - (start_ns if last is None else last.stamp_ns)
-    # Windows overlap; only the new part has weight.
+    # Windows overlap, so only the new part has weight.
     new_s = max(seconds(since_ns), 0.0)
     weight = min(new_s / site.settings.window_s, 1.0)
     measurement, looks = new_looks(memory, measurement, start_ns, site.street)

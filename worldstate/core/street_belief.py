@@ -55,7 +55,7 @@ from .budget_watch import BET_S, LOOK_NS, SLACK_NS, BudgetWatch, WatchedHop, bud
 # The alarm's threshold was set for spans in hops; these are the same spans in time.
 HOP_NS = nanoseconds(HOP_S)
 _SMOOTHED_NS, _HELD_NS = SMOOTHED_HOPS * HOP_NS, HELD_HOPS * HOP_NS
-_LEAST_NATS = -CERTAIN_NATS  # Least value that is compared with a threshold
+_LEAST_NATS = -CERTAIN_NATS  # Lowest value that is compared with a threshold
 _BET_GROUPS = COMING_S.index(BET_S) + 1
 _TWO = 0.5  # P(both) from which two sides have two vehicles
 # Parts of vehicles that come into view within three seconds.
@@ -152,7 +152,7 @@ class StreetBelief:
 
     @property
     def posterior(self) -> SequencePosterior:
-        """Distribution of the time to visible, in the form of one hop of a stream."""
+        """Distribution of the time to visible, in the form of a stream of one hop."""
         return SequencePosterior(self.coming[None], self.margin_s)
 
     @property
@@ -224,7 +224,7 @@ class StreetBelief:
         return bool(self.recent) and stamp_ns <= self.recent[-1][0] + _HELD_NS + SLACK_NS
 
     def decided_at(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the values that are compared with the threshold; without news, the least value."""
+        """Return the values that are compared with the threshold; without news, the lowest value."""
         return self.decided if self.has_news(stamp_ns) else (_LEAST_NATS,) * self.k
 
     def not_held(self, sides: Collection[int], policy: CueingPolicy, street: StreetModel) -> "StreetBelief":
@@ -375,7 +375,7 @@ def _read(
 ) -> StreetBelief:
     """Return the belief after the reading of a source: of the last three seconds, or of a single window."""
     reading, source, stamp_ns = measurement.sequence, measurement.source, measurement.stamp_ns
-    # The sound is that of a vehicle that has just come into view.
+    # `masked`: the sound is that of a vehicle that has just come into view.
     street, masked = settings.street, any(kept.emerged_since(stamp_ns, settings.street.masked_s))
     step_s = seconds(stamp_ns - kept.read_ns[source]) if source in kept.read_ns else math.inf
     if isinstance(reading, SequenceReading):
@@ -412,7 +412,7 @@ def _sequence(
     expected, share = kept.groups[sides], reading.share
     usual_in_view = float(share[BINS] / np.add.reduce(share[BINS:]))
     joint = joint_reading(at_prior(reading.groups[rows], share, expected), usual_in_view, street.by_sound)
-    # An average over hops is more certain than each hop.
+    # The exponent makes the reading more certain: the average over hops is more certain than each hop.
     usual = StreetPrior.of(expected, street).by_part
     return usual * (joint / usual) ** street.reading_gain, sides
 
