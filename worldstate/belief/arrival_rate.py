@@ -31,7 +31,7 @@ class ArrivalRate:
         return replaced(self, count=self.count + 1.0)
 
     def shift_nats(self, usual_hz: float, street: StreetModel) -> float:
-        """Return how far the log-odds of an arrival differ from the usual ones, in steps of 0.1 nats.
+        """Return the log-odds of an arrival minus the usual ones, in steps of 0.1 nats.
 
         Examples
         --------

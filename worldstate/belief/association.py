@@ -22,7 +22,7 @@ from .track import Track, Tracks, side_weights
 FORBIDDEN = -MOST_NATS
 # Size limit of a table of events and pairs: five tracks and five measurements fit, or three and twelve.
 _MOST_ENTRIES = 100_000
-_ROUNDS = 30  # Messages among twenty tracks side by side then change by less than 1e-3
+_ROUNDS = 30  # After these rounds, messages among twenty tracks side by side change by less than 1e-3
 # Gate on the squared Mahalanobis distance of a bearing or a position: 0.9997 of chi-square with four degrees
 # of freedom.
 GATE = 21.0
@@ -293,7 +293,7 @@ def _shared_class(labels: ClassShares, label: str, misread: float) -> float:
 
 
 def reached_edge(track: Track, site: SiteGeometry) -> float:
-    """Return how likely a hidden entity has reached its edge, relative to one of unknown time.
+    """Return the chance that a hidden entity has reached its edge, relative to one of unknown time.
 
     A vehicle that is believed seconds away from the edge is not the one that appears now.
     """

@@ -38,10 +38,10 @@ class Detections:
     width_rad: FloatArray  # NaN if not measured
     moving: FloatArray  # 1 or 0, NaN if unknown
     existence: FloatArray  # P(a real object | it is not a known one)
-    log_new: FloatArray  # Density of new objects and clutter, nats: 1/rad for boxes, 1/m^2 for positions
+    log_new: FloatArray  # Log density of new objects and clutter, nats: 1/rad for boxes, 1/m^2 for positions
     found: FloatArray  # P(detected | in view), 0 for messages, which need no line of sight
     classes: tuple[ClassShares, ...]
-    positions: tuple[Position, ...] = ()  # Empty for boxes
+    positions: tuple[Position, ...] = ()  # Measured positions; empty for boxes
     in_sight: bool = True  # Whether detection needs line of sight; false for messages
 
     @classmethod
@@ -80,8 +80,8 @@ class Scan:
 
     source: str
     detections: Detections  # Sorted by content: the sensor's order has no effect
-    sector: Sector | None  # None for messages, which search nothing
-    miss_rate: float | None  # None if the sensor was not queried
+    sector: Sector | None  # Searched sector; None for messages, which search nothing
+    miss_rate: float | None  # Miss rate of the look; None if the sensor was not queried
     weight: float  # Weight of a miss: looks in quick succession repeat one another's misses
     range_m: float = math.inf
     names_sector: bool = False  # Whether the sensor is one of several cameras with separate views

@@ -57,9 +57,10 @@ def hidden_bearing(coming: FloatArray, side: SideGeometry) -> tuple[float, float
     azimuth = np.minimum(np.arctan(slope), _FARTHEST_RAD)
     weight = (coming + TINY) / np.add.reduce(coming + TINY)
     mean = float(weight @ azimuth)
-    # The usual 5 degrees of the edge also cover errors of the time: the edges of five junctions deviate by
-    # 2.6. A known edge does not remove errors of the time, so half of the usual variance stays, which is
-    # likeliest on exam seed 1 with learned edges. Without it squared errors are 1.42 of the variance.
+    # The usual deviation of an edge, 5 degrees, also covers errors of the time to visible: the edges of five
+    # junctions deviate by only 2.6 degrees. A known edge does not remove these errors, so half of the usual
+    # variance is kept. This share has the highest likelihood on exam seed 1 with learned edges; without it,
+    # squared errors are 1.42 times the variance.
     edge = 0.5 * (side.edge_std_rad**2 + max(side.edge_std_rad, USUAL_EDGE_STD) ** 2)
     variance = edge + side.street.extent_rad**2 + float(weight @ (azimuth - mean) ** 2)
     return wrap_angle(sign * mean - side.yaw_rad), math.sqrt(variance)
@@ -102,7 +103,7 @@ def motion_in_view(
     """Return the motion of a vehicle that has come into view, given P(it came from a side) for each side.
 
     The mean is that of the likeliest side. The covariance includes the other sides, so that bearings can move
-    the mean there. Shapes: coming (K, 9), shares (K,).
+    the mean towards them. Shapes: coming (K, 9), shares (K,).
     """
     pairs = zip(coming, site.sides, strict=True)
     every = MotionBelief.stacked([hidden_motion(one, 0.0, side, before) for one, side in pairs])
@@ -121,7 +122,8 @@ def time_to_visible(
     .. math:: P(T \le t \mid \text{hidden}) = P(S_t \le 0 \mid S_0 > 0)
 
     The best time is that of the mean position and velocity; nine of ten entities that come in time do so
-    between low and high. The times are None if fewer than nine of ten come in time, or for several places.
+    between low and high. The times are None if fewer than nine of ten come in time, or for several positions
+    at once.
 
     Examples
     --------

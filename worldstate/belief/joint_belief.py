@@ -291,7 +291,8 @@ class JointBelief:
     """Belief over all sides, the belief from each source alone, and the trust in each sensor."""
 
     weights: FloatArray  # shape (states, ..., states, 2)
-    alone: dict[str, FloatArray] = field(default_factory=dict)  # The same shape, by source
+    # Belief from each source alone, in the same shape
+    alone: dict[str, FloatArray] = field(default_factory=dict)
     trust: dict[str, SensorTrust] = field(default_factory=dict)  # Trust by sensor
 
     def carried(self, prior: StreetPrior, street: StreetModel, step_ns: int) -> "JointBelief":
@@ -389,10 +390,10 @@ class JointBelief:
 
         .. math:: p' = (1 - r)\, E[p\, e] + r\, p, \qquad e(b) = 1 \text{ if one comes, else } p_u
 
-        with the chance r that it was another vehicle than the one believed there. E puts the believed vehicle
-        in view, and another one behind it as often as vehicles follow. It may have been believed on another
-        side if the sound confused the two. If a vehicle was believed `apart` on another side, the marginal of
-        that side stays: two vehicles are not one of unknown side.
+        with the chance r that it was another vehicle than the one believed there. E moves the believed
+        vehicle into view, and adds another one behind it with the probability of a follower. It may have been
+        believed on another side if the sound confused the two. If a vehicle was believed `apart` on another
+        side, the marginal of that side stays, because two vehicles are not one vehicle of unknown side.
         """
         likelihood = np.where(COMES, 1.0, street.unheard)
         gaps = np.diff(np.minimum((0.0, *COMING_S), street.follows_s)) / street.follows_s

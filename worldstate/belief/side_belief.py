@@ -30,7 +30,7 @@ class SideBelief:
         return sum(self.hidden) - self.both if side is None else self.hidden[side]
 
     def existence(self, side: int | None) -> float:
-        """Return P(there is a vehicle of a side); None means any side."""
+        """Return P(a vehicle of a side exists); None means any side."""
         emerged = sum(self.emerged) if side is None else self.emerged[side]
         # The sum of two exponentials can exceed one by rounding if nothing else is possible.
         return min(self.hidden_on(side) + emerged, 1.0)

@@ -23,7 +23,8 @@ def in_view(street: StreetModel) -> MotionBelief:
 
 
 IN_VIEW = in_view(StreetModel())
-# A vehicle in a crossing street is ahead, not abeam: at the default corner, up to 92 degrees.
+# Hidden vehicles are at most this far past the edge: a vehicle in a crossing street is ahead, not abeam. At
+# the default corner the limit is at 92 degrees.
 _WIDEST_RAD = math.radians(60.0)
 
 
@@ -83,7 +84,7 @@ class SiteGeometry:
 
     sides: tuple[SideGeometry, ...]  # Approach sides, in the order of the signature's directions
     view_half_angle_rad: float  # Half the field of view of the co-evidence channel, centred on the x axis
-    settings: FilterSettings  # Windows, births and deaths
+    settings: FilterSettings  # Settings of the belief
     ego_speed_mps: float = 0.0  # Speed along the x axis
     ego_yaw_rate_rad_s: float = 0.0
 
@@ -119,7 +120,7 @@ class SiteGeometry:
 
     @cached_property
     def _sight(self) -> Sector:
-        """The sector that no occluder covers, by their own directions, since the x axis turns."""
+        """The sector that no occluder covers; each occluder has its own direction, as the x axis turns."""
         ways = (-1.0, 1.0)
         return Sector.in_sight(
             *([k.edge_azimuth_rad for k in self.sides if k.outwards == way] for way in ways)
@@ -131,9 +132,9 @@ class SiteGeometry:
         return MotionBelief.stacked([*(side.prior() for side in self.sides), in_view(self.street)])
 
     def past_edge(self, azimuth_rad: FloatArray, std_rad: FloatArray, way: FloatArray) -> FloatArray:
-        """Return P(an azimuth is past the edge) for azimuths that move a way, shape (n, K).
+        """Return P(an azimuth is past the edge) for azimuths that move in the direction `way`, shape (n, K).
 
-        The way is 1 to the left, -1 to the right, 0 without a direction.
+        `way` is 1 to the left, -1 to the right, 0 without a direction.
         """
         edge_rad, edge_std, outwards = self._edges
         past = way * wrap_angle(azimuth_rad - edge_rad) / np.hypot(std_rad, edge_std)

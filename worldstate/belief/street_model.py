@@ -36,16 +36,16 @@ _SHIPPED = decode(
 
 
 def number(name: str) -> Any:
-    """Return a field whose default is the number in the shipped model."""
+    """Return a dataclass field whose default is the number in the shipped model."""
     return field(default=_SHIPPED.numbers[name].value)
 
 
 @dataclass(frozen=True, slots=True)
 class StreetModel:
-    """Parameters of the belief over the approach sides; the defaults are those that ship.
+    """Parameters of the belief over the approach sides; the defaults are those of the shipped model.
 
-    `described` gives for each its symbol, unit and reason, and whether it was fitted, measured, assumed or
-    given by the caller.
+    `described` contains the symbol, unit and reason of each number, and its origin: fitted, measured, assumed
+    or given by the caller.
 
     Raises
     ------

@@ -44,16 +44,17 @@ Objects: TypeAlias = NDArray[np.object_]
 class Track:
     """Existence, motion, class and history of one entity."""
 
-    id: str  # UUID for life
+    id: str  # UUID, constant over the life of the entity
     existence: Probability
     created_ns: int  # Birth
     updated_ns: int  # Last measurement that changed it
     # Index of the approach side on which it is hidden, from which it came, or nearest to its first sighting.
     side: Count = 0
-    seen: bool = False  # Whether vision has found it; before, its existence is a marginal of the belief
+    # Whether a camera has found it; before that, its existence is a marginal of the belief
+    seen: bool = False
     motion: MotionBelief = field(default=IN_VIEW, metadata=FLAT)  # Azimuth, rates, log range
     labels: tuple[Label, ...] = ((UNKNOWN, 1.0),)  # Class probabilities, sorted by label
-    moving: bool = True  # False if vision finds it parked
+    moving: bool = True  # False if a camera finds it parked
     sources: tuple[str, ...] = ()  # Modalities that contributed, sorted
     last_seen_ns: int | None = None
     answer: Answer = "unqueried"  # Last answer of the co-evidence channel about it
@@ -61,7 +62,7 @@ class Track:
     approach_heard: bool = False  # Whether its approach rate was ever measured
     # P(it was hidden on its side); for an entity in view, by the association at its hand-over.
     came_from: Probability = 0.0
-    place: CartesianBelief | None = None  # If there is one, `motion` follows from it
+    place: CartesianBelief | None = None  # Position, if there is one; `motion` then follows from it
     behind: Probability = 1.0  # P(no line of sight to it | exists)
     width_rad: float = 0.0  # Width of its last box
     # P(it is on a side | exists) for a sound-only entity of unknown side; otherwise empty.
@@ -96,7 +97,7 @@ class Tracks:
     miss_rate: FloatArray  # NaN without an answer
     approach_heard: BoolArray
     came_from: FloatArray
-    placed: BoolArray  # Whether it has a position; without one the next two columns are invalid
+    placed: BoolArray  # Whether a track has a position; without one, the next two columns are invalid
     place_mean: FloatArray
     place_covariance: FloatArray
     behind: FloatArray

@@ -48,7 +48,7 @@ def propagate(state: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]
     after[..., AZIMUTH] += moved.imag
     after[..., LOG_RANGE] += moved.real
     after[..., AZIMUTH_RATE], after[..., RADIAL_RATE] = w.imag, w.real
-    # The derivative x + iy of a function of complex numbers turns (real, imaginary) by ((x, -y), (y, x)).
+    # A complex derivative x + iy acts on (real, imaginary) as the matrix ((x, -y), (y, x)).
     slope[..., AZIMUTH, AZIMUTH] = slope[..., LOG_RANGE, LOG_RANGE] = 1.0
     slope[..., AZIMUTH, AZIMUTH_RATE] = slope[..., LOG_RANGE, RADIAL_RATE] = by_rate.real
     slope[..., AZIMUTH, RADIAL_RATE], slope[..., LOG_RANGE, AZIMUTH_RATE] = by_rate.imag, -by_rate.imag
@@ -86,7 +86,8 @@ def _checked_covariance(row: FloatArray) -> FloatArray:
 # No sensor measures a bearing to 0.006 degrees or an approach rate to 1e-4 1/s. Smaller deviations make a
 # covariance singular to rounding, and its checkpoint is refused; a hundred radians contain no information.
 LEAST_STD, LARGEST_STD = 1e-4, 1e2
-# The least variance as a share of the largest, so that rounding, 1e-16 of it, leaves none below zero.
+# Smallest variance as a share of the largest: rounding errors, 1e-16 of the largest, then leave no negative
+# one.
 _CONDITION = 0.1 * TINY
 
 
@@ -96,7 +97,7 @@ def conditioned(covariance: FloatArray, largest_std: float = LARGEST_STD) -> Flo
     .. math:: P \leftarrow S P S + \kappa \max_i (S P S)_{ii}\, I, \qquad
               s_i = \min(1,\ \sigma_{max} / \sigma_i)
 
-    A deviation above the largest one has no information but would cost the others their digits.
+    A deviation above the largest one contains no information but would reduce the precision of the others.
     """
     covariance = 0.5 * (covariance + covariance.mT)
     # A view of the diagonals.
@@ -143,7 +144,7 @@ _CLOSEST_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionBelief(GaussianBelief):
-    """Gaussian over (theta, theta_dot, rho, log r), the modified polar coordinates of `polar`.
+    """Gaussian over the modified polar coordinates (theta, theta_dot, rho, log r).
 
     Theta is wrapped into (-pi, pi].
     """
