@@ -76,7 +76,7 @@ class Sector:
 
 @dataclass(frozen=True, slots=True)
 class Absent:
-    """The sector was searched and the co-evidence is not there.
+    """The sector was searched and the co-evidence was not found.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class Absent:
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """The sector was searched and the co-evidence is there.
+    """The sector was searched and the co-evidence was found.
 
     Parameters
     ----------
@@ -206,7 +206,8 @@ CoEvidence = Absent | Present | Unqueried
 
 Rows = tuple[tuple[float, ...], ...]
 
-# A channel with a higher miss rate does not observe its sector: a visible vehicle would be taken for none.
+# A channel with a higher miss rate does not observe its sector: with it, a visible vehicle would count as
+# none.
 MOSTLY_MISSED = 0.5
 
 
@@ -291,8 +292,9 @@ def default_miss_rates() -> MissRateTable:
     >>> round(table(0.0), 2), round(table(np.radians(-25.0)), 2), round(table(0.0, 1.0), 2), table(1.6)
     (0.04, 0.14, 0.97, 1.0)
     """
-    # Measured in the paper on clean frames: 0.04 at boresight and 0.14 at 25 deg. The slope continues over
-    # the half plane, because the camera's own angle ends the view. Under the strongest noise it is 0.97.
+    # Measured in the paper on clean images: 0.04 at boresight and 0.14 at 25 degrees. The increase continues
+    # over the half plane, because the camera's own angle of view is the limit. Under the strongest noise it
+    # is 0.97.
     boresight, abeam_deg = 0.04, math.degrees(0.5 * math.pi)
     clean = boresight, boresight + boresight / 10.0 * abeam_deg
     return MissRateTable((0.0, abeam_deg), (0.0, 1.0), tuple((rate, 0.97) for rate in clean))

@@ -148,9 +148,9 @@ def with_bearing_vote(
               P'(k \mid hid) = (1 - d)\, P(k \mid hid) + d\, P(k \mid \theta), \quad
               P(left \mid \theta) = \tfrac{\epsilon}{2} + (1 - \epsilon)\, \Phi(\theta / \sigma)
 
-    where L-bar is the mean likelihood of visible and none. The hidden explanation gains nothing on the
-    others, and its side becomes that of the bearing :math:`\theta \pm \sigma`. A reflected sound has no
-    effect, because its peak may be an image in a wall. `SignatureEvidence.sides` is unchanged.
+    where L-bar is the mean likelihood of visible and none. The hidden explanation does not become more likely
+    relative to the others, and its side becomes that of the bearing :math:`\theta \pm \sigma`. A reflected
+    sound has no effect, because its peak may be an image in a wall. `SignatureEvidence.sides` is unchanged.
 
     Examples
     --------
@@ -159,7 +159,7 @@ def with_bearing_vote(
     >>> [round(value, 1) for value in voted.hidden], with_bearing_vote(wrong, 0.7, 0.1, 0.0) == wrong
     ([0.7, -3.9], True)
     """
-    # The sound is too rarely direct for its bearing to be used.
+    # The probability of direct sound is too low for its bearing to be used.
     if direct < 0.5 * _IMAGE or set(evidence.directions) != {"left", "right"}:
         return evidence
     hidden = np.array(evidence.hidden)
@@ -282,7 +282,7 @@ def posterior_of(prior: Sequence[float], evidence: SignatureEvidence, co_evidenc
 
 
 def log_lambda(log_prior: ArrayLike, evidence: SignatureEvidence, co_evidence: CoEvidence) -> float:
-    r"""Return the log of the mixture likelihood ratio that the Neyman-Pearson test thresholds, nats.
+    r"""Return the log of the mixture likelihood ratio, nats: the test statistic of Neyman and Pearson.
 
     .. math::
         \Lambda(y) = \frac{\ell_{hid}(y)}{w_{vis}\, \beta_c(\theta, d)\, \ell_{vis}(y) + w_0\, \ell_0(y)},

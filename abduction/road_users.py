@@ -80,7 +80,7 @@ class RoadUserModel:
     biases : ndarray, shape (classes,)
         Biases of the softmax; they include the frequencies of the classes in use.
     shares : ndarray, shape (classes,), optional
-        Those frequencies.
+        Frequencies of the classes that the biases include.
 
     Raises
     ------

@@ -140,7 +140,7 @@ def sustained_statistic(statistic: ArrayLike, sustain_hops: int) -> FloatArray:
 
 
 def sustained_alarm(held: ArrayLike, sustain_hops: int) -> BoolArray:
-    """Return whether each of the last k hops held, shape (windows,): the sustained rule for a recording.
+    """Return whether `held` is true in each of the last k hops, shape (windows,): the sustained rule.
 
     Shapes: held (windows,).
 

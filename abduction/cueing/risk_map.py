@@ -147,7 +147,7 @@ def fit_platt(statistics: ArrayLike, hazards: ArrayLike) -> PlattMap:
     ----------
     J. Platt, "Probabilistic outputs for support vector machines", 1999.
     """
-    # The errors are those of `fit_isotonic`.
+    # It raises the errors of `fit_isotonic`.
     scores, labels = _checked_sample(statistics, hazards)
     slope, offset = fit_sigmoid(_logit(scores), labels)
     if slope > 0:

@@ -18,7 +18,7 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
         1\big[\min(s_{t-k+1}, \dots, s_t) \ge \gamma\big] \le \alpha \Big\}
 
     over all N windows of all recordings; consecutive hops never span two recordings. The rate on these
-    windows never exceeds `alpha`, also with equal statistics.
+    windows never exceeds `alpha`, even if statistics are equal.
 
     Parameters
     ----------
@@ -54,6 +54,6 @@ def neyman_pearson_threshold(hazard_free: Sequence[ArrayLike], alpha: float, sus
     held = np.concatenate([np.zeros(0), *(sustained_statistic(one, sustain_hops) for one in streams)])
     if not held.size:
         raise InvalidArgumentError("hazard_free: expected at least one window")
-    # The next float above the first window that exceeds the budget.
+    # The threshold is the next float above the statistic of the first window that exceeds the budget.
     paid, least = int(budget * held.size * (1.0 + TINY)), float(np.finfo(np.float64).min)
     return least if paid >= held.size else max(float(np.nextafter(np.sort(held)[-1 - paid], np.inf)), least)

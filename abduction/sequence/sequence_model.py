@@ -151,7 +151,7 @@ COMING_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 8.0)
 OTHERS = ("seen", "other", "past", "rising", "falling", "none")
 GROUPS = (*(f"coming_{end_s:g}s" for end_s in COMING_S), *OTHERS)
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
-# Times are given for vehicles that come within this time; beyond it, the sound does not reveal the time.
+# Times are given for vehicles that come within this time; beyond it, the sound does not determine the time.
 LONGEST_S = 5.0
 STATED = COMING_S.index(LONGEST_S) + 1  # Number of groups with a time
 _HORIZONS = [COMING_S.index(end_s) for end_s in HORIZONS_S]
@@ -223,7 +223,8 @@ class SequenceAlarm:
     threshold_nats: float  # Threshold of the log-odds, averaged over 0.3 s
     onsets_per_hour: float  # Requested budget, or the expected rate if a share was requested
     asked_alpha: Probability | None = field(default=None, metadata=ADDED)  # Requested share of hops in alarm
-    promise: AlarmPromise | None = field(default=None, metadata=ADDED)  # None if no curve was measured
+    # Expected alarms at the threshold; None if no curve was measured
+    promise: AlarmPromise | None = field(default=None, metadata=ADDED)
 
 
 def _last(rates: FloatArray, most: float) -> int:
@@ -267,7 +268,8 @@ class AlarmCurve:
     alpha_low: FloatArray  # shape (points,)
     alpha_high: FloatArray  # shape (points,)
     hours: float  # Duration of the hazard-free streams
-    least_onsets: float  # Fewest expected onsets in these hours; with fewer, chance would decide
+    # Fewest expected onsets in these hours; with fewer, the threshold would depend on chance
+    least_onsets: float
 
     def __post_init__(self) -> None:
         thresholds, *names = (one.name for one in fields(self)[:-2])

@@ -76,7 +76,7 @@ class SequenceReading:
     """
 
     groups: FloatArray  # shape (2, groups): Posterior of the left and the right side
-    share: FloatArray  # shape (groups,): Its prior
+    share: FloatArray  # shape (groups,): Prior of the posterior
     margin_s: float = 0.0
     alarm: SequenceAlarm | None = None
 

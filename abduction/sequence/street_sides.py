@@ -160,7 +160,7 @@ class SidePatterns:
             return None
         usual = (sums / weights[:, None]).mean(axis=0)
         means = (sums + _DRAWN_TOGETHER * usual) / (weights + _DRAWN_TOGETHER)[:, None]
-        # The general formula, because the means are shrunk.
+        # The general formula for the scatter is used, because the means are shrunk.
         crossed = sums.T @ means
         about = np.array(self.squares) - crossed - crossed.T + (means.T * weights) @ means
         scatter = about / weights.sum()

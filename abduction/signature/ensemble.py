@@ -52,7 +52,7 @@ def site_reference(levels: ArrayLike) -> FloatArray:
               \langle x \mid \max_a x_a \le q_{0.35} \rangle\big)
 
     The last summary is the mean over the 35 % of the windows whose largest feature is lowest. It approximates
-    the site without vehicles, whatever the share of such windows is.
+    the site without vehicles for any share of such windows.
 
     Shapes: levels (windows, features), natural logarithms; returns (3 * features,).
 
@@ -107,7 +107,6 @@ def shape_features(levels: FloatArray) -> FloatArray:
 
 
 def _std(values: FloatArray) -> FloatArray:
-    """Return the standard deviation over the last axis."""
     around = values - mean(values, -1)[..., None]
     return np.asarray(np.sqrt(mean(around * around, -1)))
 
@@ -239,7 +238,7 @@ def split_reference(X: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 MOST_EXPERTS = 32
-# Used if the training sites do not determine it.
+# Default of `prior_s`, used if the training sites do not determine it.
 PRIOR_S = 10.0
 
 

@@ -24,7 +24,7 @@ SIMULATED_WEIGHT, OTHER_SIDE = 1.0, 0.25
 # Part of a real window's weight that is used with the site estimate before that window. A larger part costs a
 # standing ego 0.01 of the AUROC at the worst junction, and no such part costs a moving ego 0.01.
 HEARD_PART = 0.25
-# Site name of sounds without a street; training uses them whatever sites are left out.
+# Site name of sounds without a street; training always uses them, also if sites are left out.
 OPEN_FIELD = "open field"
 _ITERATIONS = 1000
 _WINDOW_S = 1.0
