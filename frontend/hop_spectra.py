@@ -55,7 +55,7 @@ def hop_end(index: int, sample_rate_hz: float) -> int:
 class Hop:
     """The samples of one hop."""
 
-    index: int  # From 1
+    index: int  # Number of the hop, from 1
     end: int  # Number of samples from the start of the stream to the end of this hop
     samples: Float32Array  # shape (n, M): Valid until the next hop is read
 
@@ -265,7 +265,7 @@ _MOST_CHANNELS = 8
 
 
 class LevelMeter:
-    """Log-energy per band and hop, averaged over some microphones, because the level is similar at all."""
+    """Log-energy per band and hop, averaged over some microphones, because all have similar levels."""
 
     def __init__(
         self, n_channels: int, sample_rate_hz: float, settings: FrontEndSettings, recorded_hz: float = np.inf

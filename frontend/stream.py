@@ -404,7 +404,6 @@ class FrontEnd:
 
     @property
     def _keep(self) -> BoolArray:
-        """Microphones that are used in the latest hop."""
         return self._health.mask.keep
 
     @property

@@ -119,16 +119,17 @@ def radial_speed_gradient(time_s: FloatArray, values: FloatArray) -> FloatArray:
 DRIFT_DEGREES = (1, 2, 3)
 # If the expected level changes less, it cannot be tested, because engines vary by as much.
 LEAST_SWING_DB = 3.0
-# Fewest windows in the track, three per parameter of the S-curve, and their least share of the analysed ones.
+# Fewest windows in the track, three per parameter of the S-curve, and their smallest share of the analysed
+# windows.
 _FEWEST_WINDOWS, _LEAST_SHARE = 12, 0.6
 # Largest median reduced chi-squared of the harmonics relative to one fundamental, and largest of the S-curve.
 _MOST_DISAGREEMENT, _MOST_MISFIT = 4.0, 4.0
 # Relative standard deviation added to every frequency: the jitter of a steady engine.
 _JITTER = 3e-4
-# Least difference in BIC to each alternative; 10 is "very strong" on the usual scale.
+# Smallest difference in BIC to each alternative; 10 is "very strong" on the usual scale.
 _LEAST_GAIN = 10.0
 # Limits for the slope of the line's level over -20 log10 of the fitted range (1 in the free field), and their
-# least correlation. The level of a slowing engine at the kerb remains constant.
+# smallest correlation. The level of a slowing engine at the kerb remains constant.
 _LEVEL_GAINS, _LEAST_CORRELATION = (0.4, 2.5), 0.8
 _MOST_STD_M_S = 1.0  # Largest median standard deviation of the radial speed over the track
 
@@ -255,7 +256,6 @@ def _rejected(
     unit = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
 
     def polynomial(degree: int) -> float:
-        """Return the criterion of a polynomial."""
         H = legendre.legvander(unit, degree) / std[:, None]
         chi_squared = np.sum((y - H @ np.linalg.lstsq(H, y, rcond=None)[0]) ** 2)
         return float(chi_squared + (degree + 1) * price)

@@ -16,15 +16,15 @@ from scipy import ndimage
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
-# Half way between two bins, the Hann window loses 1.4 dB without padding and 0.1 dB with four times as many.
+# Half way between two bins, the Hann window loses 1.4 dB without padding and 0.1 dB with fourfold padding.
 ZERO_PADDING = 4
 # Ratio of median and mean of an exponential variable: converts a median of powers to the noise power.
 MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 BAND_HIGH_HZ = 1200.0  # Highest partial used
 WINDOW_S, STEP_S = 0.25, 0.1  # Analysis window (Hann) and its step
 _MOST_RATE_HZ = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second
-# q, nats per partial. An empty partial has 0.6 nats on average. With a lower price f / 2 would have the
-# highest score, and with a much higher price 2 f if upper harmonics are missing.
+# q, nats per partial. An empty partial has 0.6 nats on average. With a lower price, f / 2 would have the
+# highest score; with a much higher price, 2 f would have it if upper harmonics are missing.
 _PARTIAL_PRICE = 1.0
 _FLOOR_WIDTH_HZ = 250.0  # Width of the running median that estimates the noise floor
 
@@ -112,7 +112,7 @@ def _viterbi(evidence: FloatArray, reach: int) -> IndexArray:
 
 # Largest correction in one Newton step, in resolutions 1 / window: near the edge of the main lobe.
 REACH = 0.75
-# Least ratio of power and floor for a partial to be used in the combined estimate.
+# Smallest ratio of power and floor for a partial to be used in the combined estimate.
 _LEAST_SNR = 15.0
 
 

@@ -17,8 +17,8 @@ diffraction at a corner, both describe the approach of the sound, not of the veh
 
 The randomness of the sound limits the accuracy, and averaging over microphones does not reduce it. For n
 energies over T seconds, each with a relative deviation s = (bandwidth x interval)^(-1/2), the relative error
-of TTA is about (s / 2) (TTA / T + 1/2) sqrt(12 / n). For noise from 0.3 to 20 kHz, 1 to 3 s away, it is 4.0 %
-with a window of one second, as used for a stream, and 1.5 % with two seconds.
+of TTA is about (s / 2) (TTA / T + 1/2) sqrt(12 / n). For noise from 0.3 to 20 kHz and a TTA of 1 to 3 s, it
+is 4.0 % with a window of one second, as used for a stream, and 1.5 % with two seconds.
 
 References
 ----------

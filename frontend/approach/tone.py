@@ -198,8 +198,8 @@ _PADDING = 2
 _BLOCK = 24
 # Range of resolutions around the line whose median is its floor; it begins beyond the side lobes of the line.
 _RING = (5, 40)
-# Least ratio of the peak to the floor, A^2 N / 4 sigma^2, or 15.6 dB for eta N. White noise exceeds it in one
-# of a thousand windows.
+# Smallest ratio of peak to floor, A^2 N / 4 sigma^2, or 15.6 dB for eta N. White noise exceeds it in one of a
+# thousand windows.
 _EVIDENT = 18.0
 # In white noise, the residual near a line has up to twice the power of the surroundings. More power comes
 # from the line itself: for a frequency that varies by 0.2 to 1 %, the error is 2.5 times that of white noise

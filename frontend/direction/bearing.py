@@ -134,9 +134,9 @@ def srp_phat(spectra: Complex64Array, steering: Steering) -> FloatArray:
     return normalised(steered_power(whiten(spectra), steering), n_frames, n_bins, n_microphones)
 
 
-# Only this share of the excess that noise reaches with three deviations is considered noise. With 4
-# microphones, the peak of a visible vehicle is below the full excess in a quarter of the hops. Accepted noise
-# does little harm: with its many peaks, the bearing has a stated deviation of 50 degrees.
+# Noise reaches a certain excess with three deviations; a peak below this share of it is considered noise.
+# With 4 microphones, the peak of a visible vehicle is below the full excess in a quarter of the hops.
+# Accepted noise does little harm: with its many peaks, the bearing has a stated deviation of 50 degrees.
 _DEVIATIONS, _SHARE = 3.0, 0.6
 _ALL_ROUND_RAD = np.radians(np.arange(-180.0, 180.0, 10.0))
 
@@ -282,8 +282,8 @@ def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: f
 # rings of 4 to 8 microphones, 3 to 10 cm, and visible vehicles in simulated streets with 56, 14, 7 and 4
 # microphones.
 _DISPLACEMENT, _TEMPERATURE = 0.024, 0.0125
-# The search has only two elevations, so single waves at random arrays that are not horizontal have azimuth
-# errors of 1.1 degrees. Also the least remaining power, to avoid rounding errors.
+# Smallest deviation: the search has only two elevations, so single waves at random arrays that are not
+# horizontal have azimuth errors of 1.1 degrees. Smallest remaining power, against rounding errors.
 _LEAST_STD_RAD, _LEAST_REST = float(np.radians(1.0)), 1e-3
 
 

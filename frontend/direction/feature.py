@@ -26,9 +26,9 @@ FEATURE_AZIMUTHS_RAD = np.radians(np.linspace(90.0, -90.0, 30))
 FEATURE_AZIMUTHS_RAD.flags.writeable = False
 
 # Parameters of the released data. The released features were computed with pyroomacoustics 0.3.1, whose sum
-# is not real. Later releases return another scale, with which a classifier transfers less well. The modulus
-# of the complex sum depends by about one per cent on the order of the microphones, which is that of the array
-# file.
+# is not real. Later releases return another scale, with which a classifier transfers less well to simulated
+# sound. The modulus of the complex sum depends by about one per cent on the order of the microphones, which
+# is that of the array file.
 FEATURE_BAND_HZ = (50.0, 1500.0)
 FEATURE_VERSION = "SRP-PHAT pairs 1"
 """Version of the feature, stored in every model; it changes whenever the values for a sound change."""

@@ -23,7 +23,7 @@ class Subspace:
     """Signal subspace of every bin."""
 
     vectors: ComplexArray  # Orthonormal columns, strongest last
-    eigenvalues: RealArray  # Power along them, ascending
+    eigenvalues: RealArray  # Power along these columns, ascending
 
 
 def covariance(spectra: ArrayLike) -> ComplexArray:

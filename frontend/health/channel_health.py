@@ -53,7 +53,7 @@ class Dropout:
     # are a copy of earlier ones.
     kind: DropoutKind
     sample: int  # First sample, from the start of the stream
-    # Length; for a repeat within about ten samples; None for a splice, whose length is unknown.
+    # Length, for a repeat accurate to about ten samples; None for a splice, whose length is unknown.
     n_samples: int | None
 
 

@@ -213,10 +213,10 @@ _DROPPED = 1e-5
 # A channel crackles if its peak-to-peak value grows by this factor more than those of the others; a loud
 # event raises all channels.
 _CRACKLE = 4.0
-# Least offset: a tenth of the peak-to-peak value (0.7 standard deviations), evaluated after two seconds.
+# Smallest offset: a tenth of the peak-to-peak value (0.7 standard deviations), evaluated after two seconds.
 _OFFSET = 0.1
 _SETTLED_HOPS = 20
-# Least share of clipped samples; a single peak has less.
+# Smallest share of clipped samples; a single peak has less.
 _CLIPPED_SHARE = 1e-4
 # Enough for a report; the number of dropouts includes older ones.
 _KEPT_DROPOUTS = 16

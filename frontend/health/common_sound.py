@@ -1,4 +1,4 @@
-r"""Sound common to the microphones, and whether it can come from far sources at their positions.
+r"""Test for sound that is common to the microphones and agrees with their positions and far sources.
 
 Wind, converter noise and samples in a wrong format are independent between microphones, but the sound of a
 street is not. Over pairs and bins with a coherence above 0.1 in a diffuse field,
@@ -38,8 +38,8 @@ _KEPT = np.float32(0.8)
 _OVERLAP = 1.0 + 2.0 / 36.0
 # Fewest frames for a comparison: after a loss of sound, the sums of earlier frames never reach zero.
 _LEAST_FRAMES = 1.0
-# Standard deviations of noise that are subtracted from v, which varies most in the first hops. Three of them,
-# at nine frames per hop, may be at most the minimum v of clean streets minus the maximum of unusable ones.
+# Three standard deviations of noise are subtracted from v, which varies most in the first hops. At nine
+# frames per hop, they may be at most the minimum v of clean streets minus the maximum v of unusable ones.
 _SIGMAS, _FRAMES, _MOST_STD = 3.0, 9.0, 0.03
 # Coherence relative to a diffuse field. Clean simulated streets of both renderers with 4 to 56 microphones
 # have at least 0.09 in 99 % of the hops (lowest for four microphones 0.3 to 0.9 m apart), 4,202 hops of real
@@ -51,8 +51,9 @@ _IN_COMMON = (0.04, 0.1)
 _IN_BIN, _BINS, _FEWEST_BINS = 0.04, (0.3, 0.5), 6
 # Three hops: a shorter change is random variation.
 _COVERED_HOPS = 3
-# Misfit of a second: at most 0.32 in clean streets of both renderers with 11 arrays of 4 to 56; mostly 0.7 to
-# 1.3 for channels in random orders; 0.7 to 1 during seven seconds of a siren with equally long echoes.
+# Misfit of a second: at most 0.32 in clean streets of both renderers with 11 arrays of 4 to 56 microphones;
+# mostly 0.7 to 1.3 for channels in random orders; 0.7 to 1 during seven seconds of a siren with equally long
+# echoes.
 _MISFIT = 0.4
 # Change of the agreement per second, and its range. In the right order, a siren makes the agreement negative
 # only if it lasts twice as long as the sound that fitted before; three fitting seconds make it positive

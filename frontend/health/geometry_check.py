@@ -219,7 +219,7 @@ def best_card(values: FloatArray, power: FloatArray, candidates: FloatArray) -> 
 
 # Delays tested in one second, added to those of the seconds before: half a period of 700 Hz.
 _SEARCH_S = np.arange(-8e-4, 8.01e-4, 2e-5)
-# Duration of the memory, and the least durations for a result on delays and on drifts.
+# Duration of the memory, and the smallest durations for a result on delays and on drifts.
 _MEMORY_S, _MIN_DELAY_S, _MIN_DRIFT_S = 30, 6, 8
 # Agreement relative to the median channel below which the delay of a channel is meaningless.
 _GOOD = 0.3
@@ -231,12 +231,12 @@ _MOSTLY = 0.7
 _NEAR = 0.5
 # With fewer free delays, any variation looks like a card.
 _MIN_FREEDOM = 3.0
-# Least delay of a card and of one channel, and least length of its pattern divided by the root of the number
-# of channels. Scattering at the roof delays a vehicle's sound by 0.1 ms at random. In simulated streets (8
-# microphones, 10 s), the length is 0.135 ms or more with a card 0.3 ms late; without one it is mostly below
-# 0.09 ms and at most 0.14 ms.
+# Smallest delay of a card and of a single channel, and smallest length of its pattern divided by the root of
+# the number of channels. Scattering at the roof delays a vehicle's sound by 0.1 ms at random. In simulated
+# streets (8 microphones, 10 s), the length is 0.135 ms or more with a card 0.3 ms late; without one it is
+# mostly below 0.09 ms and at most 0.14 ms.
 _DELAY_S, _LONE_DELAY_S, _DELAY_RMS_S = 1.5e-4, 4e-4, 4.6e-5
-# Least drift, 20 parts per million, and least length of its pattern over twenty seconds. The sound of a
+# Smallest drift, 20 parts per million, and smallest length of its pattern over twenty seconds. The sound of a
 # passing vehicle, scattered at the roof, looks like a drift for some seconds; the error falls with time to
 # the power 3/2.
 _DRIFT, _DRIFT_LENGTH, _DRIFT_SPAN_S = 2e-5, 2e-5, 20.0
@@ -369,7 +369,7 @@ def _named(card: Card, fault: Fault, std: float) -> list[ChannelFault]:
 
 # Incoherent power of a usable channel relative to the field: delay mismatch and self-noise of real arrays.
 _NOISE = 0.2
-# The same for a channel that does not predict others: its weight becomes negligible.
+# Incoherent power of a channel that does not predict others: its weight becomes negligible.
 _UNUSABLE = 1e3
 
 
@@ -411,8 +411,8 @@ _MIN_COHERENCE = 0.15
 # Coherence relative to the median at which a channel becomes suspect and recovers. In simulated streets,
 # healthy channels are above 0.59 and incoherent ones below 0.07.
 _SUSPECT, _WELL = 0.3, 0.45
-# Least gain at another position. In simulated streets, a channel at its correct position gains at most 0.18
-# elsewhere; swapped channels that are 9 cm or more apart across the road gain 0.25 to 0.75.
+# Smallest gain at a different position. In simulated streets, a channel at its correct position gains at most
+# 0.18 elsewhere; swapped channels that are 9 cm or more apart across the road gain 0.25 to 0.75.
 _MARGIN = 0.3
 # Channels that may be reassigned have the first gain at some position. A swap is reported only if the channel
 # whose position is taken has at least the second gain elsewhere.

@@ -40,8 +40,8 @@ _PARTS, _BANDS, _FEWEST, _MOST = 60, 192, 10, 24
 _DELAYS = 201
 # At least two seconds, so that a single word does not determine the result.
 LEAST_PARTS = 8
-# From wavelengths of eight spacings, whose phases begin to differ, to wavelengths with slight aliasing. The
-# limits in Hz also suit a smaller array, in case the positions are in inches.
+# From wavelengths of eight spacings, at which phases begin to differ, to wavelengths with slight aliasing.
+# The limits in Hz also suit a smaller array, in case the positions are in inches.
 _BAND, _LEAST_TOP_HZ, _BOTTOM_HZ = (0.25, 1.5), 2000.0, (200.0, 1000.0)
 # Phases hardly change in a band with a width of the speed of sound over this many extents of the array.
 _EXTENTS = 16.0
@@ -53,7 +53,7 @@ _WAVES_RAD = np.array(np.meshgrid(_AZIMUTHS_RAD, _ELEVATIONS_RAD)).reshape(2, -1
 # Sizes within 9 % are accepted: sources above the plane of an array make it seem smaller.
 _RIGHT = (1.0, 0.92, 1.09)
 _OFF = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0, 10.0, 25.4, 39.37, 1 / 10, 1 / 25.4, 1 / 39.37)
-# Least gain of another order and of another size in the logarithm of the unexplained part, and in standard
+# Smallest gain of another order and of another size in the logarithm of the unexplained part, and in standard
 # deviations. In simulated rooms, right orders lose at least 0.5 by a change. Right sizes lose at least 0.09
 # (rings of 4) or 0.01 (56 microphones, of which one direction explains a tenth). Wrong sizes gain at least
 # 0.02.
@@ -67,7 +67,7 @@ OFF_BY_30 = (0.77, 1.3)
 # Smallest unexplained share of the coherent energy, and the distance relative to the array's extent below
 # which two microphones are considered to be at one place.
 _LEAST_LEFT, _SAME_PLACE = 0.02, 0.05
-# Single wave: least share that one direction explains, and least share of the parts from it. With 56
+# Single wave: smallest share that one direction explains, and smallest share of the parts from it. With 56
 # simulated microphones, one direction explains 0.2 to 0.6 in rooms and 0.64 or more of single sources in the
 # open, and nine tenths of their parts are within 5 degrees.
 _DIRECT, _PARTS_OF_ONE = 0.5, 0.8
@@ -366,7 +366,7 @@ class Comparison:
         return places | {_turned(one): np.array([heard_from_rad - one]) for one in steps[1:].tolist()}
 
     def _miss(self, azimuths_rad: FloatArray, at_rad: float) -> float:
-        """Return the least angle between azimuths and a direction; equivalent directions are equal."""
+        """Return the smallest angle between azimuths and a direction; equivalent directions are equal."""
         delays = MicrophoneArray(self._positions).delays_s(azimuths_rad)
         nearest = np.square(delays[:, None] - self._claimed.waves.delays_s).sum(axis=-1).argmin(axis=1)
         return float(np.abs(wrap_angle(self._claimed.waves.azimuths_rad[nearest] - at_rad)).min())
