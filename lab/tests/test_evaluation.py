@@ -322,7 +322,7 @@ def test_windows_of_another_array_are_refused(streets, tmp_path):
 
 def test_recordings_that_could_not_be_heard_are_named_where_too_few_are_left():
     takes = tuple(Take(Path(kind), kind, "SA1", kind, 5.0) for kind in ("left", "none"))
-    with pytest.raises(InvalidArgumentError, match=r"found 1 .*; not heard: right: cut short"):
+    with pytest.raises(InvalidArgumentError, match=r"found 1 .*; not processed: right: cut short"):
         lacking_data(TakeList(Path("streets"), takes, (), (), False), [Failed("right", "cut short")])
 
 

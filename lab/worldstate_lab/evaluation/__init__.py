@@ -1,1 +1,1 @@
-"""The paper's evaluation as one protocol: every method hears the same trials and answers in the same form."""
+"""The paper's evaluation as one protocol: every method receives the same trials and returns the same type."""

@@ -34,19 +34,19 @@ from worldstate_lab.metrics.stream_statistic import (
 
 @dataclass(frozen=True, slots=True)
 class AblationSwitches:
-    """What is left in.
+    """Which parts of the statistic are in use.
 
     Parameters
     ----------
     use_absence : bool
-        (a) False: the signature alone, whatever the camera answered.
+        (a) False: only the signature is used; the result of the camera query is ignored.
     calibrated : bool
-        (b) False: the raw statistic is read as the risk.
+        (b) False: the raw statistic is taken as the risk.
     approach_weights : tuple of float
-        Weights of looming that may be taken; the one with the largest AUROC on the calibration folds is.
+        Candidate weights of looming. The one with the largest AUROC on the calibration folds is used.
         ``(0.0,)`` leaves looming out.
     alpha, sustain_hops : float, int
-        Budget and sustained rule.
+        Budget and number of hops of the sustained rule.
 
     Raises
     ------
@@ -77,26 +77,26 @@ class AblationSwitches:
 
 @dataclass(frozen=True, slots=True)
 class AblationRow:
-    """One row of the table; None where the streams hold nothing to form it from."""
+    """One row of the table; a value is None if the streams contain no data for it."""
 
-    auroc: float | None  # Windows before T0 against hazard-free ones
-    detected: float | None  # Share of approaches announced before T0, and by how much in the mean
+    auroc: float | None  # Windows before T0 against hazard-free windows
+    detected: float | None  # Share of approaches announced before T0, and their mean lead time
     lead_time_s: float | None
     false_alarms_per_hour: float | None  # On hazard-free recordings
     window_rate: float | None
-    ece: float | None  # Of the risk on the same windows, with its sampling floor
+    ece: float | None  # ECE of the risk on the same windows, with its sampling floor
     ece_floor: float | None
     brier: float | None
-    # Share of the hops after T0, while the vehicle is in view, in which a detection is there or P(hidden) +
-    # P(visible) is above its threshold, and in which a detection is there.
+    # Share of the hops after T0 with the vehicle in view in which it is detected or P(hidden) + P(visible) is
+    # above its threshold; below, the share in which it is detected.
     awareness: float | None
     vision_only: float | None
-    approach_weight: float  # Mean of the weights chosen
+    approach_weight: float  # Mean of the chosen weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:
-    """One held-out recording with what the calibration folds made of it."""
+    """One held-out recording with the statistic, alarm and risk set on the calibration folds."""
 
     stream: HopTable
     statistic: FloatArray
@@ -121,9 +121,9 @@ def evaluate_ablation(
     reference_prior : sequence of float
         Prior of the statistic.
     rng : numpy.random.Generator
-        Deals recordings to folds, and draws the floor of the ECE.
+        Assigns recordings to folds and draws the floor of the ECE.
     switches : AblationSwitches, optional
-        What is left in; all of it where not given.
+        Parts in use; by default all.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def evaluate_ablation(
     Returns
     -------
     AblationRow
-        Detection, lead, false alarms and calibration at these switches.
+        Detection, lead time, false alarms and calibration with these switches.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def ablation_table(
     seed: int,
     switches: AblationSwitches | None = None,
 ) -> dict[str, AblationRow]:
-    """Evaluate everything on, each part off, and looming added; the folds are the same in every row."""
+    """Evaluate the full statistic, each part switched off, and looming added, on the same folds."""
     base = switches or AblationSwitches()
     rows = {
         "full": base,
@@ -183,7 +183,7 @@ def ablation_table(
 
 
 class _Learned:
-    """Weight, thresholds and risk map of the calibration folds."""
+    """Weight, thresholds and risk map set on the calibration folds."""
 
     def __init__(
         self, streams: Sequence[HopTable], prior: Sequence[float], switches: AblationSwitches
@@ -244,7 +244,7 @@ def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
 def presence_statistic(
     stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches
 ) -> FloatArray:
-    """Return P(hidden) + P(visible) at a fixed prior at every hop: whether anything is there, shape (n,)."""
+    """Return P(hidden) + P(visible), the probability of any vehicle, at a fixed prior per hop, shape (n,)."""
     joint = log_joint(stream, reference_prior, switches)
     something = np.logaddexp.reduce(joint[:, :-1], axis=1)
     return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))

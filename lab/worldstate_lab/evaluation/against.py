@@ -1,4 +1,4 @@
-"""What an evaluation leaves on disk to be compared with, and the comparison of two of them."""
+"""Scores that an evaluation saves for later comparison, and the comparison of two evaluations."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping
@@ -19,10 +19,10 @@ from .reduction import BEARING_COLUMNS
 from .scores import COUNTS, Score, Scored, paired_on
 
 NAME = "scores.npz"
-# Of the arrays and of what figures mean: counts that a later version adds are another version.
+# Version of the arrays and of the meaning of the figures. Added counts need a new version.
 VERSION = 2
 MAX_BYTES = 4 << 30
-# Of the names of recordings that an error spells out.
+# Maximum number of recordings that an error message lists by name.
 _TOLD = 3
 
 Key = tuple[str, str]  # Protocol and method
@@ -30,21 +30,21 @@ Key = tuple[str, str]  # Protocol and method
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One method under one protocol in two evaluations, on the recordings that both have."""
+    """One method under one protocol in two evaluations, on the recordings common to both."""
 
     protocol: str
     method: str
-    shared: int  # Recordings of the same name, junction and content
-    # Figure: ours less the other's, and the middle 95 % over draws of the shared recordings.
+    shared: int  # Recordings with equal name, junction and content
+    # By figure: our value minus the other one, and the central 95 % over draws of the shared recordings.
     differences: Mapping[str, tuple[float, float, float]]
 
 
-# What a score keeps as one array, which is written as it stands.
+# Fields of a score that are one array each and are written unchanged.
 _PLAIN = tuple(one.name for one in fields(Score) if one.name not in ("recordings", "counts", "bearings"))
 
 
 def save_scores(folder: Path, scores: Mapping[str, Mapping[str, Score]]) -> None:
-    """Write every score, by protocol and by method, in place of those of an earlier evaluation."""
+    """Write every score by protocol and method; the scores of an earlier evaluation are replaced."""
     every = [(protocol, method, one) for protocol, some in scores.items() for method, one in some.items()]
     heads = [
         {"protocol": protocol, "method": method, "recordings": [asdict(row) for row in score.recordings]}
@@ -57,7 +57,7 @@ def save_scores(folder: Path, scores: Mapping[str, Mapping[str, Score]]) -> None
 
 
 def load_scores(folder: Path) -> dict[Key, Score]:
-    """Read what `save_scores` wrote, by protocol and method."""
+    """Read the scores that `save_scores` wrote, by protocol and method."""
     path = folder / NAME
     if not path.is_file():
         raise InputFileError(folder, f"expected a finished evaluation, with {NAME} in it")
@@ -70,7 +70,7 @@ def compare(ours: Path, other: Path, rng: np.random.Generator, draws: int = DRAW
     Raises
     ------
     InvalidArgumentError
-        If they share no method under any protocol, or no recording.
+        If the evaluations share no method under any protocol, or no recording.
     """
     a, b = load_scores(ours), load_scores(other)
     both = [key for key in a if key in b]
@@ -87,14 +87,14 @@ def compare(ours: Path, other: Path, rng: np.random.Generator, draws: int = DRAW
 
 def _compare(key: Key, a: Score, b: Score, rng: np.random.Generator, draws: int) -> Comparison:
     rows, others = _shared_rows(a, b)
-    # Strata of the shared recordings alone: a stratum that lost some is drawn at the size that is left.
+    # Strata of the shared recordings only: a stratum that lost recordings is drawn at its remaining size.
     samples = stratified_draws([a.draw_strata[row] for row in rows], rng, draws)
     return Comparison(*key, len(rows), paired_on(a, b, rows, others, samples))
 
 
 def _shared_rows(a: Score, b: Score) -> tuple[IndexArray, IndexArray]:
-    """Return the rows of the recordings that both have, in the order of the first."""
-    # A recording that was cut or edited since keeps its name: its content has to be the same as well.
+    """Return the rows of the shared recordings in both scores, in the order of the first."""
+    # A recording that was cut or edited in the meantime keeps its name, so its content must match as well.
     place = {(one.site, one.name, one.fingerprint): row for row, one in enumerate(b.recordings)}
     keys = [(one.site, one.name, one.fingerprint) for one in a.recordings]
     pairs = [(row, place[key]) for row, key in enumerate(keys) if key in place]
@@ -103,7 +103,7 @@ def _shared_rows(a: Score, b: Score) -> tuple[IndexArray, IndexArray]:
 
 
 def _nothing_shared(pairs: list[tuple[Score, Score]]) -> str:
-    """Return why no recording is in both: other names, or the same names with other content."""
+    """Return why the evaluations share no recording: other names, or equal names with other content."""
     ours, other = ({(r.site, r.name) for pair in pairs for r in pair[i].recordings} for i in (0, 1))
     same = sorted(ours & other)
     if same:

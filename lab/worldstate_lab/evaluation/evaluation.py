@@ -1,4 +1,4 @@
-"""The whole evaluation: recordings are heard once, every protocol is run on them, everything is scored."""
+"""The complete evaluation: front-end on all recordings once, then every protocol, then all scores."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -56,7 +56,7 @@ ALPHA = 0.02
 
 
 class Progress(Interface):
-    """Shows progress: hands on the items of a step with so many of them."""
+    """Reports progress: yields the items of a step whose number is known."""
 
     def __call__(self, items: Iterable[Item], description: str, total: int, /) -> Iterator[Item]:
         """Yield the items."""
@@ -65,43 +65,43 @@ class Progress(Interface):
 
 @dataclass(frozen=True, slots=True)
 class EvaluationSettings:
-    """How an evaluation is done."""
+    """Options of an evaluation."""
 
-    seeds: tuple[int, ...] = (1,)  # Of the folds, which are drawn again for each
-    hazard_free_hours: float | None = None  # Of hazard-free time that is scored; all where not given
-    draws: int = DRAWS  # Samples of recordings that intervals are read from
-    degradation: DegradationSettings | None = None  # Of the camera; not swept where not given
-    stage_streams: bool = False  # Whether camera and rain are staged on hazard-free streams as well
+    seeds: tuple[int, ...] = (1,)  # Seeds of the folds, which are drawn again for each seed
+    hazard_free_hours: float | None = None  # Hazard-free time to score; by default all
+    draws: int = DRAWS  # Resamples of the recordings, from which intervals are computed
+    degradation: DegradationSettings | None = None  # Sweep over camera degradations; None: no sweep
+    stage_streams: bool = False  # Whether camera degradation and rain are staged on hazard-free streams too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """What was found on every protocol that the data suffice for."""
+    """Results of every protocol for which there are enough data."""
 
     takes: TakeList
     trials: tuple[Trial, ...]
-    failed: tuple[Failed, ...]  # Recordings that could not be heard
-    lacking: Mapping[str, str]  # By protocol that was not run: what it needs and does not find
+    failed: tuple[Failed, ...]  # Recordings that could not be processed
+    lacking: Mapping[str, str]  # By protocol that was not run: the required data and what was found
     runs: Mapping[str, ProtocolRun]
     scores: Mapping[str, Mapping[str, Score]]  # By protocol and method
-    draws: Mapping[str, IndexArray]  # Samples of recordings by protocol, the same for every method
-    front_end: FrontEndStudy | None  # Of the standing ego, whose camera is a reference
-    degradation: DegradationStudy | None  # Ablation (c), on the filmed recordings
+    draws: Mapping[str, IndexArray]  # Resamples of the recordings by protocol, the same for every method
+    front_end: FrontEndStudy | None  # With a standing ego, whose camera is a reference
+    degradation: DegradationStudy | None  # Ablation (c), on the recordings with video
     settings: EvaluationSettings
-    # By protocol and method that is not scored: why its model was not made for the sound of a recording.
+    # By protocol and method that is not scored: why its model does not fit the sound of a recording.
     refused: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    # By protocol that does not leave junctions out.
+    # By protocol with folds over recordings.
     equal: Mapping[str, Sequence[EqualDetection]] = field(default_factory=dict)
-    staged: StreamSweep | None = None  # Camera and rain on hazard-free streams
+    staged: StreamSweep | None = None  # Camera degradation and rain on hazard-free streams
 
 
 def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, str]:
-    """Say for each protocol that cannot be run what it lacks; refuse where none can."""
+    """Return what each protocol lacks that cannot be run; raise an error if none can be run."""
     every = (*takes.static, *takes.dynamic)
     lacking = {one.name: what for one in PROTOCOLS if (what := one.lacks(every)) is not None}
     if len(lacking) == len(PROTOCOLS):
         told = "; ".join(f"{name} {what}" for name, what in lacking.items())
-        unheard = "".join(f"; not heard: {one.name}: {one.problem}" for one in failed)
+        unheard = "".join(f"; not processed: {one.name}: {one.problem}" for one in failed)
         raise InvalidArgumentError(f"{takes.root}: no protocol can be run: {told}{unheard}")
     return lacking
 
@@ -114,13 +114,13 @@ def evaluate(
     track: Progress,
     settings: EvaluationSettings,
 ) -> Evaluation:
-    """Hear all recordings, run every protocol that they suffice for and score every method."""
+    """Process all recordings, run every protocol for which they suffice and score every method."""
     lacking_data(takes)
     every = (*takes.static, *takes.dynamic)
     heard, failed = hear(track(attempted(hearing, every, jobs, attrgetter("name")), "listening", len(every)))
     trials = within_hours(heard, settings.hazard_free_hours)
     left = _left(takes, trials)
-    # Again, on what is left: one broken recording of a small data set may be one too many.
+    # Checked again on the remaining recordings: in a small data set one broken recording may be too many.
     lacking = lacking_data(left, failed)
     own = {
         one: [trial for trial in trials if bool(trial.hops.about["moving"]) == one.moving]
@@ -149,7 +149,7 @@ def evaluate(
             if not run.protocol.by_junction
         },
     )  # fmt: skip
-    # Broken videos may leave a sweep fewer recordings than it needs: no reason to lose all other figures.
+    # Broken videos may leave too few recordings for a sweep; the other figures are kept in that case.
     if settings.degradation is not None:
         with _noted(lacking, "degradation sweep"):
             found = replace(found, degradation=_degradation(left, hearing, jobs, track, settings.degradation))
@@ -166,7 +166,7 @@ def _scored(run: ProtocolRun, track: Progress) -> dict[str, Score]:
 
 @contextmanager
 def _noted(lacking: dict[str, str], name: str) -> Iterator[None]:
-    """Note what a part of the evaluation lacks in place of its result."""
+    """Store what a part of the evaluation lacks if it raises an error for missing data."""
     try:
         yield
     except InvalidArgumentError as error:
@@ -174,14 +174,14 @@ def _noted(lacking: dict[str, str], name: str) -> Iterator[None]:
 
 
 def _left(takes: TakeList, trials: Sequence[Trial]) -> TakeList:
-    """Return the recordings that were heard and are scored, a stream if any piece of it is."""
+    """Return the recordings that were processed and are scored; a stream is kept if any piece of it is."""
     names = {str(trial.hops.about.get("stream", trial.name)) for trial in trials}
     kept = [tuple(one for one in some if one.name in names) for some in (takes.static, takes.dynamic)]
     return replace(takes, static=kept[0], dynamic=kept[1])
 
 
 def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSettings:
-    """Return the settings of a sweep over all filmed recordings, in place of an even choice of them."""
+    """Return the settings of a sweep over all recordings with video instead of an evenly spaced choice."""
     calm = [take.hazard_free for take in takes.static if take.filmed]
     return replace(settings, approaches=calm.count(False), hazard_free=calm.count(True))
 
@@ -189,11 +189,11 @@ def whole_sweep(takes: TakeList, settings: DegradationSettings) -> DegradationSe
 def _degradation(
     takes: TakeList, hearing: Hearer, jobs: int, track: Progress, settings: DegradationSettings
 ) -> DegradationStudy:
-    """Run the sweep; the recordings are worked on as all others are, and what was seen is kept."""
+    """Run the sweep on recordings processed like all others; detections are cached."""
     model, filmed = read_model(settings.model), [take for take in takes.static if take.filmed]
     for take in filmed:
         if (refusal := model_refusal(take, model)) is not None:
-            raise InvalidArgumentError(f"needs a model that was made for this sound; {refusal}")
+            raise InvalidArgumentError(f"needs a model for this sound; {refusal}")
 
     def over(work: Callable[[SweepItem], Tables], items: Sequence[SweepItem]) -> Iterator[Tables | str]:
         done = track(attempted(work, items, jobs), "degrading the camera", len(items))
@@ -207,13 +207,13 @@ def _degradation(
 
 @dataclass(frozen=True, slots=True)
 class _StagedStream:
-    """Work on one stream, in any process."""
+    """Processes one stream in any worker process."""
 
     hearing: Hearer
     seed: int
 
     def __call__(self, take: Take) -> HopTable:
-        """Return the advisories of every state of the camera, or what an earlier run found."""
+        """Return the advisories in every camera state, from the cache if an earlier run stored them."""
         folder, model = self.hearing.folder, self.hearing.model
         mark = fingerprint(take.path, folder / "fingerprints")
         key = [STREAM_VERSION, mark, states_told(), encode(read_model(model)), self.seed]
@@ -225,7 +225,7 @@ class _StagedStream:
 
 
 def _staged(found: Evaluation, takes: TakeList, hearing: Hearer, jobs: int, track: Progress) -> StreamSweep:
-    """Stage every state of camera and roof on the hazard-free streams."""
+    """Stage every state of the camera and every level of rain on the hazard-free streams."""
     names = {str(t.hops.about["stream"]) for t in found.trials if "stream" in t.hops.about}
     streams = [take for take in takes.static if take.name in names]
     if not streams:

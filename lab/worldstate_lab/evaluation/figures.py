@@ -1,9 +1,10 @@
-"""Every figure of an evaluation: its title, its decimals and how it is counted; and what the paper states.
+"""Figures of an evaluation with title, decimals and definition, and the values that the paper states.
 
-Our figures stand in `figures.csv`. A mean of the rates of single recordings would let one of ten seconds
-weigh as much as a stream of an hour: a figure is a ratio of sums. Those a recording are the challenge's: each
-one with a vehicle in view counts once. Every number of the paper's sections IV, VII, VIII and IX stands in
-`paper_values.csv`, in the order of the paper; the text says .881 where Table I prints .88: both are 37 of 42.
+Our figures are defined in `figures.csv`. Each is a ratio of sums over recordings, because in a mean of rates
+a recording of ten seconds would weigh as much as a stream of one hour. Figures per recording follow the
+challenge: each recording with a vehicle in view counts once. `paper_values.csv` lists every number of the
+paper's sections IV, VII, VIII and IX in the order of the paper. The text of the paper has 0.881 where Table I
+has 0.88; both are 37 of 42.
 """
 
 import csv
@@ -23,12 +24,13 @@ _UNITS = {"": 1.0, "per hour": 1.0 / (HOP_S / SECONDS_PER_HOUR), "degrees": floa
 
 @dataclass(frozen=True, slots=True)
 class FigureKind:
-    """What is printed of a figure, and the ratio of sums over recordings that it is, where it is one."""
+    """How a figure is printed, and the two sums over recordings of which it is the ratio, if it is one."""
 
     title: str
-    digits: int  # Decimals that the numbers of recordings at hand can bear
-    worse: str  # The worse end, where junctions are compared: low, high or empty
-    counts: tuple[str, str]  # See `reduction`; empty where it is no ratio of sums
+    digits: int  # Printed decimals, as many as the number of recordings supports
+    worse: str  # Which end is worse when junctions are compared: low, high or empty
+    # Numerator and denominator, see `reduction`; empty if the figure is not a ratio of sums
+    counts: tuple[str, str]
     unit: float
 
     @property
@@ -51,12 +53,13 @@ FIGURES = {row["figure"]: _kind(row) for row in _rows("figures.csv")}
 
 
 def titles(figures: Iterable[str]) -> tuple[str, ...]:
-    """Return the titles of figures, as heads of columns."""
+    """Return the titles of figures, used as column heads."""
     return tuple(FIGURES[name].title for name in figures)
 
 
-# What fills a number, by what it stands on: the positions of the microphones, this machine, OVAD's sound and
-# video, the sound of the two roadside corpora; "stated" is said of the data or the setting and is no outcome.
+# The command that computes a number, by the data that the number requires: microphone positions, this
+# machine, OVAD's sound and video, or the sound of the two roadside corpora. "stated" marks properties of the
+# data or settings, which are no results.
 COMMANDS = {
     "array": "worldstate array bounds",
     "machine": "worldstate-lab bench",
@@ -68,13 +71,13 @@ COMMANDS = {
 
 @dataclass(frozen=True, slots=True)
 class PaperValue:
-    """One number of the paper: where it stands, what it means, and its interval if the paper gives one."""
+    """One number of the paper: its place and meaning, and its interval if the paper gives one."""
 
     section: str
-    basis: str  # One of `COMMANDS`
-    group: str  # Name of the protocol, or part of the paper
+    basis: str  # A key of `COMMANDS`
+    group: str  # Name of the protocol, or of a part of the paper
     row: str  # Method, or condition
-    figure: str  # As `Score.figures` names it, where it does
+    figure: str  # Key in `Score.figures`, if it has one
     value: float
     low: float
     high: float
@@ -82,9 +85,9 @@ class PaperValue:
 
     @property
     def digits(self) -> int:
-        """Decimals with which the paper prints it, such as 3 of 0.881 and 2 of 0.70."""
+        """Number of decimals that the paper prints, such as 3 in 0.881 and 2 in 0.70."""
         stated = len(f"{self.value:.10g}".partition(".")[2])
-        # A float keeps no trailing zero; shares and areas have two decimals everywhere in the paper.
+        # A float has no trailing zeros; the paper prints shares and areas with at least two decimals.
         return max(stated, 2) if stated and self.unit in ("share", "") else stated
 
 
@@ -98,7 +101,7 @@ _BY_NAME = {(one.group, one.row, one.figure): one for one in PAPER_VALUES}
 
 
 def paper_value(group: str, row: str, figure: str) -> PaperValue | None:
-    """Return what the paper states there, None where it states nothing.
+    """Return the number that the paper states for a figure, or None if it states none.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Front-end accuracy and approach rate on the trials of a protocol: the figures of the paper's section IX."""
+"""Accuracy of the front-end and approach rate on the trials of a protocol (section IX of the paper)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from worldstate_lab.metrics.intervals import Interval, middle, pooled_draws, str
 from worldstate_lab.metrics.track_measures import gated_median_deg
 from worldstate_lab.trials.trial import Trial
 
-# The paper's figure of looming is of the last three seconds before the pass.
+# The paper computes its looming figures on the last three seconds before the pass.
 IMMINENT_S = 3.0
-# A slope read as a time: beyond this there is nothing that approaches.
+# A slope is converted into a time of arrival; a longer time than this means that nothing approaches.
 LONGEST_TTA_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class SiteError:
-    """Median error of the SRP bearings in view at one site, with its interval over recordings."""
+    """Median error of the SRP bearings in view at one site, with an interval over recordings."""
 
     median_deg: float
     interval_deg: Interval
@@ -29,20 +29,20 @@ class SiteError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrontEndStudy:
-    """Bearings against the camera, prominence, looming and tonal Doppler, with intervals over recordings."""
+    """Bearing errors against the camera, prominence, looming and Doppler, with intervals over recordings."""
 
     # `bearing_srp_deg`, `bearing_music_deg`, `bearing_gated_deg`, `prominence_in_view`,
     # `prominence_in_silence`, `looming_auroc`, `looming_correlation`, `doppler_usable` (count).
     figures: Mapping[str, float]
     intervals: Mapping[str, Interval]
     by_site: Mapping[str, SiteError]
-    frames: int  # Line-of-sight frames with a moving box to compare with
+    frames: int  # Line-of-sight frames with a moving reference box
     approaches: int
     checked: HopTable  # `prominence` and `error_rad` of every hop, for the gating curve
 
 
 def front_end_study(trials: Sequence[Trial], rng: np.random.Generator, draws: int = 500) -> FrontEndStudy:
-    """Count the figures, and draw recordings again for their intervals."""
+    """Compute the figures, and resample recordings for their intervals."""
     approaches = [trial for trial in trials if not trial.hazard_free]
     strata = [(trial.label, trial.site) for trial in trials]
     drawn = stratified_draws(strata, rng, draws)
@@ -81,7 +81,7 @@ def _figures(trials: Sequence[Trial], rows: IndexArray) -> dict[str, float]:
 
 
 def _looming(approaches: Sequence[HopTable], calm: Sequence[HopTable]) -> dict[str, float]:
-    """How well the slope tells the last seconds before the pass from silence, and the time itself."""
+    """Return how well the slope separates the last seconds before the pass from silence."""
     passing = [hops for hops in approaches if hops.about["pass_s"] is not None]
     left_s = [float(hops.about["pass_s"]) - hops.time_s for hops in passing]
     imminent = [
@@ -108,7 +108,7 @@ def _site_error(approaches: Sequence[HopTable], rng: np.random.Generator, draws:
 
 
 def _checked(hops: HopTable) -> HopTable:
-    """Bearings of one recording beside the prominence of their windows."""
+    """Return the bearings of one recording with the prominence of their windows."""
     return HopTable({"prominence": hops.prominence, "error_rad": hops.srp_rad - hops.reference_rad})
 
 

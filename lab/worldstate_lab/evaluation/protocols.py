@@ -1,4 +1,4 @@
-"""Which recordings calibrate and which are tested, and every method fitted and asked on them."""
+"""Split of recordings into calibration and test, and every method fitted and applied on each split."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,16 +21,16 @@ FOLDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """One way to part recordings into calibration and test."""
+    """One way to split recordings into calibration and test."""
 
     name: str
     title: str
-    moving: bool = False  # Whether it is about the recordings of a moving ego
-    by_junction: bool = False  # Leave one junction out, instead of folds over recordings
-    trained_on: TrainedOn = "all"  # What the published classifier is trained on
+    moving: bool = False  # Whether it uses the recordings with a moving ego
+    by_junction: bool = False  # Leave one junction out instead of folds over recordings
+    trained_on: TrainedOn = "all"  # Training data of the published classifier
 
     def lacks(self, takes: Sequence[Take]) -> str | None:
-        """Say what is missing for this protocol, before anything is heard; None where nothing is."""
+        """Return what is missing for this protocol, or None; no recording is processed for it."""
         chosen = [take for take in takes if take.moving == self.moving]
         counts = Counter("none" if take.hazard_free else "approach" for take in chosen)
         least = {"approach": 2, "none": 2}
@@ -44,12 +44,12 @@ class Protocol:
             if len(both) < 2:
                 wanted.append(f"2 junctions with approaches and hazard-free recordings, found {len(both)}")
         ego = "moving" if self.moving else "standing"
-        return f"needs, of a {ego} ego, " + " and ".join(wanted) if wanted else None
+        return f"needs, with a {ego} ego, " + " and ".join(wanted) if wanted else None
 
     def parts(
         self, trials: Sequence[Trial], rng: np.random.Generator
     ) -> Iterator[tuple[list[int], list[int]]]:
-        """Yield rows of calibration and test recordings; every recording is tested once."""
+        """Yield rows of calibration and test recordings; every recording is a test recording once."""
         fold_of = self._by_junction(trials) if self.by_junction else _dealt(trials, rng)
         for fold in np.unique(fold_of[fold_of >= 0]).tolist():
             calibration = np.flatnonzero(fold_of != fold).tolist()
@@ -60,13 +60,13 @@ class Protocol:
             yield calibration, tested
 
     def _by_junction(self, trials: Sequence[Trial]) -> np.ndarray:
-        """Return the number of each junction; streams belong to none, calibrate and are never tested."""
+        """Return the number of each trial's junction; streams have none and are used only for calibration."""
         names = junctions_with_both([(trial.site, trial.hazard_free) for trial in trials])
         return np.array([names.index(j) if (j := junction_of(t.site)) in names else -1 for t in trials])
 
 
 STATIC = Protocol("static", "Standing ego, five folds")
-STANDING = STATIC.name  # What most of the report is on
+STANDING = STATIC.name  # Protocol of most sections of the report
 DYNAMIC = Protocol("dynamic", "Moving ego, five folds", moving=True)
 FIXED = Protocol("junctions_fixed", "One junction out, classifier fixed", by_junction=True)
 RETRAINED = Protocol(
@@ -79,7 +79,7 @@ PROTOCOLS = (STATIC, DYNAMIC, FIXED, RETRAINED)
 
 
 def junctions_with_both(sites: Sequence[tuple[str, bool]]) -> list[str]:
-    """Return the junctions that have approaches and hazard-free recordings, by name."""
+    """Return the names of the junctions that have both approaches and hazard-free recordings, sorted."""
     kinds: dict[str, set[bool]] = {}
     for site, hazard_free in sites:
         kinds.setdefault(junction_of(site), set()).add(hazard_free)
@@ -87,7 +87,7 @@ def junctions_with_both(sites: Sequence[tuple[str, bool]]) -> list[str]:
 
 
 def _dealt(trials: Sequence[Trial], rng: np.random.Generator) -> np.ndarray:
-    """Deal recordings to folds, the pieces of a stream in runs, so that neighbours stay together."""
+    """Assign recordings to folds; consecutive pieces of a stream stay together."""
     whole = [i for i, trial in enumerate(trials) if "stream" not in trial.hops.about]
     fold_of = np.full(len(trials), -1)
     if whole:
@@ -97,7 +97,7 @@ def _dealt(trials: Sequence[Trial], rng: np.random.Generator) -> np.ndarray:
         if free >= 2 or not streamed:
             fold_of[whole] = deal_folds(labels, sites, rng, FOLDS)
         else:
-            # All hazard-free time is in streams: the approaches are dealt alone.
+            # All hazard-free time is in streams: only the approaches are assigned.
             fold_of[whole] = rng.permutation(np.arange(len(whole)) % FOLDS)
     pieces: dict[str, list[int]] = {}
     for i, trial in enumerate(trials):
@@ -110,25 +110,25 @@ def _dealt(trials: Sequence[Trial], rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProtocolRun:
-    """What every method said of every tested recording, once a seed."""
+    """Decisions of every method on every test recording, for each seed."""
 
     protocol: Protocol
     trials: tuple[Trial, ...]
-    # By method: a pass a seed, each with one answer a trial, in the order of the trials.
+    # By method: one pass per seed with one element per trial, in the order of the trials.
     decisions: Mapping[str, tuple[tuple[Decisions, ...], ...]]
     seeds: tuple[int, ...]
-    trained_on: str  # What the published classifier was trained on
+    trained_on: str  # Training data of the published classifier
 
     @property
     def stands_on(self) -> dict[str, float]:
-        """How many recordings of either kind were scored, and the hours without a vehicle."""
+        """Number of scored recordings of either kind, and the hours without a vehicle."""
         calm = [len(trial.hops) for trial in self.trials if trial.hazard_free]
         counts = {"recordings": len(self.trials), "approaches": len(self.trials) - len(calm)}
         return {**counts, "hazard_free": len(calm), "hazard_free_hours": sum(calm) * HOP_S / SECONDS_PER_HOUR}
 
     @property
     def basis(self) -> str:
-        """What the figures stand on, as a sentence."""
+        """The data behind the figures, as a sentence."""
         of = self.stands_on
         return (
             f"{of['recordings']:.0f} recordings: {of['approaches']:.0f} approaches and "
@@ -137,9 +137,9 @@ class ProtocolRun:
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """What to say beside figures from so few approaches or hazard-free recordings."""
+        """Warnings to print beside figures from few approaches or few hazard-free recordings."""
         calm = sum(trial.hazard_free for trial in self.trials)
-        # Either kind by itself: no number of approaches makes the false alarms of three recordings readable.
+        # Each kind is checked alone: many approaches do not help if false alarms come from three recordings.
         kinds = {"approaches": len(self.trials) - calm, "hazard-free recordings": calm}
         return tuple(said for what, count in kinds.items() if (said := caution(count, what)) is not None)
 
@@ -151,11 +151,11 @@ def run_protocol(
     classifiers: Classifiers,
     seeds: Sequence[int],
 ) -> ProtocolRun:
-    """Fit and ask all methods on all folds, for every seed; by junction the first seed is the only one.
+    """Fit and apply all methods on all folds for every seed; by junction, only the first seed is used.
 
-    The trials are those of the ego motion that the protocol is about.
+    The trials must have the ego motion of the protocol.
     """
-    # Junctions are not drawn: another seed would give the same folds.
+    # Junctions are not drawn at random: another seed would give the same folds.
     used = tuple(seeds[:1]) if protocol.by_junction else tuple(seeds)
     passes: list[dict[str, dict[int, Decisions]]] = []
     for seed in used:
@@ -195,18 +195,18 @@ METHODS: tuple[Method, ...] = (
     ShippedChain("+ site adaptation", "adapted"),
     ShippedChain("world-state advisory", "filtered"),
 )
-# Ablation of the approach rate in the grounded likelihood, eq. (5), and looming as a weight beside it.
+# Ablation of the approach rate in the grounded likelihood, eq. (5); looming as a weight is another row.
 GROUNDED: tuple[Method, ...] = (
     CalibratedCue("shipped scores .02", 0.02, absence=True, evidence="shipped"),
     CalibratedCue("grounded .02", 0.02, absence=True, evidence="grounded"),
     CalibratedCue("grounded without approach rate .02", 0.02, absence=True, evidence="rateless"),
 )
-# The operating curve: budgets of the proposed method beside those of the table.
+# Budgets of the proposed method for the operating curve, in addition to those of the table.
 CURVE_ALPHAS = (0.0, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2)
 
 
 def methods_for(trials: Sequence[Trial]) -> tuple[Method, ...]:
-    """Return the rows that can be formed of these trials: a chain that nothing was heard with has none."""
+    """Return the methods that can be scored on these trials; a chain needs results in every trial."""
     heard = set.intersection(*(set(trial.chains) for trial in trials)) if trials else set()
     refused = refused_methods(trials)
     curve = tuple(CalibratedCue(f"curve {alpha:g}", alpha) for alpha in CURVE_ALPHAS)
@@ -218,7 +218,7 @@ def methods_for(trials: Sequence[Trial]) -> tuple[Method, ...]:
 
 
 def refused_methods(trials: Sequence[Trial]) -> dict[str, str]:
-    """Return by row that is not scored why the model was not made for the sound of a recording."""
+    """Return, by method that is not scored, why its model does not fit the sound of a recording."""
     refused = {key: why for trial in trials for key, why in trial.refused.items()}
     return {
         method.name: refused[said_by]
@@ -228,5 +228,5 @@ def refused_methods(trials: Sequence[Trial]) -> dict[str, str]:
 
 
 def _said_by(method: Method) -> str:
-    """Return the chain or the scores that a row is formed of."""
+    """Return the name of the chain or of the scores that a method uses."""
     return method.chain if isinstance(method, ShippedChain) else str(getattr(method, "evidence", ""))

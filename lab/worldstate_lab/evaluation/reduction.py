@@ -1,4 +1,4 @@
-"""What a method said of one recording, reduced to sums and samples from which every figure follows."""
+"""A method's decisions on one recording, reduced to sums and samples from which every figure is computed."""
 
 from functools import lru_cache
 
@@ -15,14 +15,14 @@ from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
 from worldstate_lab.trials.trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
 
-# The paper's, before line-of-sight entry.
+# The paper's horizons before line-of-sight entry.
 HORIZONS_S = {"all": np.inf, "2s": 2.0, "1s": 1.0}
 BEARING_COLUMNS = ("recording", "error_rad", "prominence")
 _SIDES = {"left": LEFT, "right": RIGHT}
 
 
 def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
-    """Count what the alarms of one recording say, before T0 or in hazard-free time."""
+    """Count the alarms of one recording, before T0 or in hazard-free time."""
     onsets = rising_edges(said.alarm)
     if trial.hazard_free:
         spent = {
@@ -34,7 +34,7 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     t0_s = in_range(f"{trial.name}: line-of-sight entry", trial.t0_s, -np.inf, np.inf)
     lead_s = t0_s - said.time_s
     before = lead_s > SLACK_S
-    # Relative to T0, so that the lead comes back to the last bit and finds its hop.
+    # Relative to T0, so that the lead is bit-identical and matches its hop.
     outcome = onset_outcome(-lead_s[onsets], 0.0)
     first = onsets[lead_s[onsets] == outcome.lead_s]
     named = int(said.side[first[0]]) if outcome.detected else NO_SIDE
@@ -45,16 +45,17 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
         "early_onsets": float(outcome.onsets_earlier),
         "side_right": float(named != NO_SIDE and named == _SIDES.get(trial.label)),
         "onsets_before": float(before[onsets].sum()),
-        # Hops at which an onset would be counted: an alarm at random has one of them with equal chances.
+        # Hops at which an onset would be counted: a random alarm falls on each of them with equal
+        # probability.
         "window_s": float((before & (lead_s <= LONGEST_LEAD_S + SLACK_S)).sum()) * HOP_S,
         "before_s": float(before.sum()) * HOP_S,
     }
 
 
 def awareness_counts(trial: Trial, said: Decisions) -> dict[str, float]:
-    """Count hops after T0 with a vehicle in view, and those with an alarm or any moving box."""
+    """Count the hops after T0 with a vehicle in view, and those of them with an alarm or any moving box."""
     clear = in_view(trial, said)
-    # Any moving box: which vehicle a box shows is known of no real recording.
+    # Any moving box: in real recordings it is not known which vehicle a box shows.
     seen = np.zeros(len(said.time_s), bool)
     at = hop_of(trial.boxes.time_s, said.time_s)
     seen[at[(at >= 0) & np.asarray(trial.boxes.moving, bool)]] = True
@@ -62,13 +63,13 @@ def awareness_counts(trial: Trial, said: Decisions) -> dict[str, float]:
 
 
 def in_view(trial: Trial, said: Decisions) -> BoolArray:
-    """Hops of an approach after T0 with a moving reference box in view, shape (n,)."""
+    """Return a mask of the hops after T0 with a moving reference box in view, shape (n,)."""
     after = (not trial.hazard_free) & ~trial.hops.before_sight()
     return np.asarray(after & np.isfinite(trial.hops.reference_rad))
 
 
 def hop_of(time_s: FloatArray, hops_s: FloatArray) -> IndexArray:
-    """Return the nearest hop of each time, -1 where it is more than half a hop away, shape (n,).
+    """Return the nearest hop of each time, or -1 if it is more than half a hop away, shape (n,).
 
     Examples
     --------
@@ -82,7 +83,7 @@ def hop_of(time_s: FloatArray, hops_s: FloatArray) -> IndexArray:
 
 
 def scored_windows(trial: Trial, values: FloatArray, horizon_s: float = np.inf) -> FloatArray:
-    """Return the known values of hazard-free time, or of the last `horizon_s` before T0, shape (m,)."""
+    """Return the finite values in hazard-free time, or in the last `horizon_s` before T0, shape (m,)."""
     used = np.isfinite(values)
     if not trial.hazard_free:
         used &= trial.hops.before_sight(horizon_s)
@@ -90,7 +91,7 @@ def scored_windows(trial: Trial, values: FloatArray, horizon_s: float = np.inf) 
 
 
 def window_counts(trial: Trial, said: Decisions) -> dict[str, float]:
-    """Count the windows of each horizon, and sum the squared errors of the risk."""
+    """Count the windows in each horizon, and sum the squared errors of the risk."""
     risk = scored_windows(trial, said.risk)
     counts = {
         f"windows_{name}": float(scored_windows(trial, said.score, horizon_s).size)
@@ -100,14 +101,14 @@ def window_counts(trial: Trial, said: Decisions) -> dict[str, float]:
 
 
 def probability_bins(risk: FloatArray) -> FloatArray:
-    """Return windows, summed risk and summed variance of its labels in each bin, shape (BINS, 3)."""
+    """Return number of windows, summed risk and summed label variance in each bin, shape (BINS, 3)."""
     index = np.minimum((risk * BINS).astype(np.intp), BINS - 1)
     sums = (None, risk, risk * (1.0 - risk))
     return np.stack([np.bincount(index, weights, BINS).astype(np.float64) for weights in sums], axis=-1)
 
 
 def bearing_samples(trial: Trial, said: Decisions, recording: int) -> HopTable:
-    """Return absolute errors beside the prominence of their peaks, while a reference box is in view."""
+    """Return absolute bearing errors and prominences of the peaks for hops with a reference box in view."""
     use = in_view(trial, said) & np.isfinite(said.bearing_rad)
     error_rad = np.abs(wrap_angle(said.bearing_rad[use] - trial.hops.reference_rad[use]))
     columns = (np.full(error_rad.size, recording), error_rad, trial.hops.prominence[use])
@@ -115,7 +116,7 @@ def bearing_samples(trial: Trial, said: Decisions, recording: int) -> HopTable:
 
 
 def visible_counts(trial: Trial, said: Decisions) -> dict[str, float]:
-    """Sum the errors of stated times to visible over the hops before T0, and the true times themselves."""
+    """Sum the true times to visible and the errors of the predicted ones over the hops before T0."""
     true_s = np.where(trial.hops.before_sight(), trial.t0_s - said.time_s, np.nan)
     errors = visible_errors(said.visible_s, true_s)
     if not errors.count:
@@ -132,7 +133,7 @@ def visible_counts(trial: Trial, said: Decisions) -> dict[str, float]:
 
 
 def track_counts(trial: Trial, said: Decisions) -> dict[str, float]:
-    """Measure the tracks of one recording against the vehicles in view."""
+    """Score the tracks of one recording against the vehicles in view."""
     measured = track_measures(_track_rows(said), _truth_rows(trial, said), HOP_S)
     if not measured.active_s:
         return {}
@@ -150,7 +151,7 @@ def track_counts(trial: Trial, said: Decisions) -> dict[str, float]:
 
 
 def gospa_counts(trial: Trial, said: Decisions, by_tracks: bool) -> dict[str, float]:
-    """Sum the GOSPA over the hops with a vehicle in view: of the tracks, or of the bearing while in alarm."""
+    """Sum the GOSPA over the hops with a vehicle in view: of the tracks, or of the bearing during alarms."""
     truth, tracks = _truth_rows(trial, said), _track_rows(said)
     stated = said.alarm & np.isfinite(said.bearing_rad)
     rows = (
@@ -161,8 +162,7 @@ def gospa_counts(trial: Trial, said: Decisions, by_tracks: bool) -> dict[str, fl
     return {"gospa_rad": sum(costs), "gospa_hops": float(len(costs))}
 
 
-# Seeds and thresholds leave the bearing of a method as it is, so that most pairs come again and again, and
-# each assignment takes a tenth of a millisecond.
+# A method's bearing does not depend on seed or threshold, so most pairs recur. Each assignment takes 0.1 ms.
 @lru_cache(maxsize=1 << 16)
 def _gospa(estimates_rad: tuple[float, ...], truths_rad: tuple[float, ...]) -> float:
     return gospa_bearing(estimates_rad, truths_rad).total_rad
@@ -183,7 +183,7 @@ def _track_rows(said: Decisions) -> TrackRows:
 
 def _truth_rows(trial: Trial, said: Decisions) -> TruthRows:
     hop = hop_of(trial.truth.time_s, said.time_s)
-    # A camera faster than the hops shows a vehicle several times in one of them.
+    # A camera faster than the hop rate shows a vehicle several times per hop.
     _, first = np.unique(np.stack([hop, trial.truth.vehicle]), axis=1, return_index=True)
     use = np.sort(first[hop[first] >= 0])
     vehicle, in_view = trial.truth.vehicle[use].astype(np.int64), trial.truth.in_view[use].astype(bool)
@@ -191,7 +191,7 @@ def _truth_rows(trial: Trial, said: Decisions) -> TruthRows:
 
 
 def check_decisions(trial: Trial, said: Decisions) -> None:
-    """Refuse an answer of other hops than those of the recording, and a risk that is no probability."""
+    """Raise an error if decisions have other hops than the recording, or a risk is not a probability."""
     check_shape(f"{trial.name}: time_s of the decisions", said.time_s.shape, trial.hops.time_s.shape)
     if ((said.risk < 0.0) | (said.risk > 1.0)).any():
         raise InvalidArgumentError(f"{trial.name}: risk: expected numbers in [0, 1]")

@@ -1,6 +1,6 @@
-"""What decisions are worth: the figures of every method and protocol, with intervals over recordings.
+"""Figures of every method and protocol, with intervals over recordings.
 
-False alarms at equal detection: what two ways to warn cost where their thresholds detect as much.
+They include false alarms at equal detection: two alarm rules are compared at thresholds with equal detection.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -39,7 +39,7 @@ from .reduction import alarm_counts
 
 _HOURS = HOP_S / SECONDS_PER_HOUR
 _RATIOS = {name: (*kind.counts, kind.unit) for name, kind in FIGURES.items() if any(kind.counts)}
-# What one recording adds; a count that it does not have is zero.
+# Sums per recording; a missing count is zero.
 COUNTS = (
     *dict.fromkeys(name for ratio in _RATIOS.values() for name in ratio[:2]),
     *("onsets_before", "window_s", "before_s"),
@@ -51,12 +51,12 @@ _RISK, _RAW = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """Which recording one row stands for; what two evaluations compare to find the ones they share."""
+    """Identity of the recording of one row, by which two evaluations find their shared recordings."""
 
     name: str
     label: str
     site: str
-    fingerprint: str = ""  # Of its content
+    fingerprint: str = ""  # Of the recording's content
 
     @classmethod
     def of(cls, trial: Trial) -> "Scored":
@@ -66,9 +66,9 @@ class Scored:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """What one method scored under one protocol, once for every seed that changes its answers.
+    """The score of one method under one protocol, once for every seed that changes its decisions.
 
-    S seeds, R recordings of which P are approaches and Q hazard-free.
+    There are S seeds and R recordings: P approaches and Q hazard-free ones.
 
     Parameters
     ----------
@@ -77,11 +77,11 @@ class Score:
     counts : mapping of str to ndarray, shape (S, R)
         Sums over the hops of each recording.
     wins : ndarray, shape (S, horizons, P, Q)
-        How often windows of an approach score above those of a hazard-free recording.
+        How often a window of an approach scores above a window of a hazard-free recording.
     bins : ndarray, shape (S, 2, R, bins, 3)
-        Windows, summed probability and summed variance of labels by probability: of the risk and the score.
+        Number of windows, summed probability and summed label variance by bin, for the risk and the score.
     bearings : tuple of HopTable, length S
-        Bearing errors in view beside the prominence of their peaks.
+        Bearing errors in view with the prominence of their peaks.
 
     Examples
     --------
@@ -105,14 +105,15 @@ class Score:
 
     @classmethod
     def of(cls, trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> "Score":
-        """Score what was said of the trials: one pass a seed, each with one answer a trial in order."""
+        """Score the decisions on the trials: one pass per seed, each with one element per trial, in order."""
         if not (trials and passes):
             raise InvalidArgumentError("trials: expected at least one recording and one pass over them")
         for said in passes:
             check_shape("decisions of a pass", (len(said),), (len(trials),))
             for trial, one in zip(trials, said, strict=True):
                 reduction.check_decisions(trial, one)
-        # What no seed changes is scored once: a fixed chain hands out the very same answers.
+        # Decisions that no seed changes are scored once: a fixed chain returns the same objects for each
+        # seed.
         if all(one is first for said in passes for one, first in zip(said, passes[0], strict=True)):
             passes = passes[:1]
         rows = [_counts(trials, said) for said in passes]
@@ -126,11 +127,11 @@ class Score:
 
     @property
     def draw_strata(self) -> list[tuple[str, str]]:
-        """Label and site of every recording: what `stratified_draws` keeps the numbers of."""
+        """Label and site of every recording, the strata of `stratified_draws`."""
         return [(one.label, one.site) for one in self.recordings]
 
     def figures(self, rows: IndexArray | None = None) -> dict[str, float]:
-        """Return every figure on the chosen recordings, mean over seeds; NaN where there is none to count."""
+        """Return every figure on the chosen recordings, mean over seeds; NaN if there is nothing to count."""
         chosen = np.arange(len(self.recordings)) if rows is None else rows
         return {name: float(values[0]) for name, values in self.draws(chosen[None]).items()}
 
@@ -139,25 +140,26 @@ class Score:
         return self._values(draw_weights(draws, len(self.recordings)))
 
     def intervals(self, draws: IndexArray) -> dict[str, Interval]:
-        """Return the middle 95 % of every figure over draws, and the exact interval of the false alarms."""
-        # The ECE of a draw lies above that of the recordings themselves: read its interval as a width.
+        """Return the central 95 % of every figure over draws, and the exact interval of the false alarms."""
+        # The ECE of a draw is higher than that of the recordings: only the width of its interval is
+        # meaningful.
         exact = {"false_alarms_per_hour_poisson": self.poisson()}
         return {name: middle(values) for name, values in self.draws(draws).items()} | exact
 
     def poisson(self) -> Interval:
-        """Return the exact interval of the false alarms an hour, all recordings together."""
+        """Return the exact interval of the false alarms per hour over all recordings."""
         onsets, hours = self._false_onsets()
         return poisson_interval(onsets, hours) if hours else (float("nan"), float("nan"))
 
     def poisson_upper(self) -> float:
-        """Return what the false alarms an hour do not exceed with a confidence of .9."""
+        """Return the upper bound of the false alarms per hour at a confidence of 0.9."""
         onsets, hours = self._false_onsets()
         return poisson_upper(onsets, hours) if hours else float("nan")
 
     def _false_onsets(self) -> tuple[int, float]:
-        """Return alarms and hours of hazard-free time."""
+        """Return the number of alarms and the hours of hazard-free time."""
         hours = float(self.counts["free_hops"].mean(axis=0).sum()) * _HOURS
-        # Seeds hear the same hours: their mean count is one count, not one of S times the hours.
+        # All seeds use the same hours: their mean is one count, not a count over S times the hours.
         return round(float(self.counts["free_onsets"].mean(axis=0).sum())), hours
 
     def by_site(self) -> dict[str, dict[str, float]]:
@@ -170,7 +172,7 @@ class Score:
         }
 
     def worst_sites(self) -> dict[str, tuple[str, float]]:
-        """Return the worst junction and its value, of figures with a better and a worse end."""
+        """Return the worst junction and its value for each figure that has a better and a worse end."""
         sites = self.by_site()
         return {
             name: worst_group({site: one[name] for site, one in sites.items()}, worse)
@@ -184,7 +186,7 @@ class Score:
         return np.array([one.label == "none" for one in self.recordings])
 
     def _values(self, weights: FloatArray) -> dict[str, FloatArray]:
-        """Return every figure where recording r counts weights[d, r] times, shape (D,)."""
+        """Return every figure with weight weights[d, r] for recording r, shape (D,)."""
         names = list(self.counts)
         sums = dict(zip(names, np.array([self.counts[name] for name in names]) @ weights.T, strict=True))
         figures = {
@@ -204,7 +206,8 @@ class Score:
 
     def _areas(self, weights: FloatArray) -> dict[str, FloatArray]:
         r"""Return the areas under the ROC curve: :math:`w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)`."""
-        # Between recordings wins are counted once; a draw then weighs them instead of ranking its windows.
+        # Wins are counted once per pair of recordings. A draw weights them; its windows need not be ranked
+        # again.
         high, low = weights[:, ~self._free], weights[:, self._free]
         areas = {}
         for i, horizon in enumerate(reduction.HORIZONS_S):
@@ -221,8 +224,8 @@ class Score:
         windows = total[..., 0].sum(axis=-1)
         ece = ratio(np.abs(total[..., 1] - hazards).sum(axis=-1), windows)
         share = ratio(hazards.sum(axis=-1), windows)[:, _RISK]
-        # Labels drawn from the risks miss their sum by a normal deviate of variance V, and by less than 2 V
-        # in expectation, which is what holds in a bin of few or certain windows.
+        # The sum of labels drawn from the risks differs from its mean by a normal deviate of variance V, and
+        # by less than 2 V in expectation; the latter holds in bins with few or nearly certain windows.
         variance = total[:, _RISK, ..., 2]
         floor = np.minimum(np.sqrt(2.0 / np.pi * variance), 2.0 * variance).sum(axis=-1)
         brier = ratio(sums["squared_error"], windows[:, _RISK])
@@ -235,7 +238,7 @@ class Score:
         }
 
     def _random_detection(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> FloatArray:
-        """Return what as many onsets at random moments before T0 would detect, shape (S, D)."""
+        """Return the share that as many onsets at random moments before T0 would detect, shape (S, D)."""
         rates = np.full(sums["before_s"].shape, np.nan)
         times = weights * ~self._free
         for s, before_s in enumerate(sums["before_s"]):
@@ -246,7 +249,7 @@ class Score:
 
 
 def paired(ours: Score, other: Score, draws: IndexArray) -> dict[str, tuple[float, float, float]]:
-    """Return ours less the other's of every figure, with the middle 95 % on the same draws of recordings."""
+    """Return our value minus the other for every figure, with the central 95 % on the same draws."""
     if ours.recordings != other.recordings:
         raise InvalidArgumentError("scores: expected two methods on the same recordings in the same order")
     rows = np.arange(len(ours.recordings))
@@ -256,16 +259,16 @@ def paired(ours: Score, other: Score, draws: IndexArray) -> dict[str, tuple[floa
 def paired_on(
     ours: Score, other: Score, ours_rows: IndexArray, other_rows: IndexArray, draws: IndexArray
 ) -> dict[str, tuple[float, float, float]]:
-    """Compare two scores on the recordings in these rows of each; draws (D, n) are of places in the rows."""
+    """Compare two scores on the recordings in these rows of each; draws (D, n) index the rows."""
     every = np.vstack([np.arange(len(ours_rows)), draws])
     a, b = ours.draws(ours_rows[every]), other.draws(other_rows[every])
-    # Both stumble over the same hard recordings: on the same draws those cancel, apart they would not.
+    # Both methods fail on the same hard recordings. These errors cancel only if both use the same draws.
     gains = {name: a[name] - b[name] for name in a}
     return {name: (float(gain[0]), *middle(gain[1:])) for name, gain in gains.items()}
 
 
 def _counts(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[dict[str, float]]:
-    """Return the counts of every recording; a method is not judged by what it never states."""
+    """Return the counts of every recording; a quantity that a method never returns is not scored."""
     sides, tracks = any(one.side.any() for one in said), any(len(one.tracks) for one in said)
     bearings = any(np.isfinite(one.bearing_rad).any() for one in said)
     rows = []
@@ -280,7 +283,7 @@ def _counts(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[dict[str
 
 
 def _wins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
-    """Return how often windows of approaches outrank hazard-free ones, shape (horizons, P, Q)."""
+    """Return how often windows of approaches rank above hazard-free ones, shape (horizons, P, Q)."""
     pairs = list(zip(trials, said, strict=True))
     calm = [reduction.scored_windows(trial, one.score) for trial, one in pairs if trial.hazard_free]
     near = [(trial, one.score) for trial, one in pairs if not trial.hazard_free]
@@ -294,7 +297,7 @@ def _bins(trials: Sequence[Trial], said: Sequence[Decisions]) -> FloatArray:
     pairs = list(zip(trials, said, strict=True))
     risks = [reduction.scored_windows(trial, one.risk) for trial, one in pairs]
     raw = [reduction.scored_windows(trial, one.score) for trial, one in pairs]
-    # Log odds and ratios are scores as well, but no probabilities.
+    # Log-odds and ratios are valid scores but not probabilities.
     if any(((score < 0.0) | (score > 1.0)).any() for score in raw):
         raw = [np.zeros(0)] * len(raw)
     return np.array([[reduction.probability_bins(one) for one in some] for some in (risks, raw)])
@@ -306,12 +309,12 @@ def _bearings(trials: Sequence[Trial], said: Sequence[Decisions]) -> HopTable:
 
 
 def _visible_figures(sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Return the RMSE of the stated time to visible, and that of the constant that fits these truths best."""
+    """Return the RMSE of the predicted time to visible, and that of the constant that fits the truth best."""
     hops = sums["visible_hops"]
     spread = ratio(sums["visible_true_squared"], hops) - ratio(sums["visible_true"], hops) ** 2
     return {
         "visible_error_s": np.sqrt(ratio(sums["visible_squared"], hops)),
-        # The difference of two means may be -1e-16 where all truths are equal.
+        # The difference of two means may be -1e-16 if all truths are equal.
         "visible_error_constant_s": np.sqrt(np.maximum(spread, 0.0)),
     }
 
@@ -319,7 +322,7 @@ def _visible_figures(sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
 def _bearing_figures(samples: HopTable, weights: FloatArray) -> dict[str, FloatArray]:
     """Return the median error of all bearings and of the most prominent ones, shape (D,) each."""
     times = weights[:, samples.recording.astype(np.intp)]
-    # The threshold of prominence is that of each draw, as it would be set on those recordings.
+    # The prominence threshold is set on each draw, as it would be on those recordings.
     gated = times * highest_share(samples.prominence, times, PUBLISHED_COVERAGE)
     kinds = {"bearing_deg": times, "bearing_gated_deg": gated}
     return {name: np.degrees(weighted_median(samples.error_rad, kept)) for name, kept in kinds.items()}
@@ -327,24 +330,24 @@ def _bearing_figures(samples: HopTable, weights: FloatArray) -> dict[str, FloatA
 
 BASELINE, OURS = "published, sustained", "world-state advisory"
 DETECTED = (0.8, 0.85, 0.9, 0.95)
-# Shares of the hazard-free scores above a threshold, where few alarms are left each of them by itself; and
-# of the scores before T0, beside the highest one of each approach, above which it is missed.
+# Quantiles used as thresholds. Hazard-free: dense where few alarms remain. Before T0: including the highest
+# score of each approach, above which the approach is missed.
 _CALM_SHARES, _NEAR_SHARES = np.geomspace(1e-5, 0.5, 60), np.linspace(0.0, 1.0, 30)
 _COUNTS = ("approaches", "detected", "free_hops", "free_onsets")
-# From a score and a threshold to the alarm of a recording.
+# Maps a score and a threshold to the alarm of a recording.
 Rule = Callable[[FloatArray, float], BoolArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OperatingCurve:
-    """What the alarms of every threshold count on every recording, shape (thresholds, R) each."""
+    """Counts of the alarms at every threshold on every recording, shape (thresholds, R) each."""
 
     counts: Mapping[str, FloatArray]
 
     def alarms_per_hour(self, detected: float, weights: FloatArray) -> FloatArray:
-        """Return the least false alarms an hour of a threshold that detects so much, shape (D,).
+        """Return the lowest false-alarm rate of any threshold that detects this share, per hour, shape (D,).
 
-        Recording r counts weights[d, r] times; infinite where no threshold detects so much.
+        Recording r has weight weights[d, r]; the result is infinite if no threshold detects the share.
         """
         sums = {name: weights @ count.T for name, count in self.counts.items()}
         share = ratio(sums["detected"], sums["approaches"])
@@ -354,12 +357,12 @@ class OperatingCurve:
 
 @dataclass(frozen=True, slots=True)
 class EqualDetection:
-    """Two ways to warn where both detect so much."""
+    """False alarms of two alarm rules at equal detection."""
 
     detected: float
-    ours: float  # False alarms an hour; infinite where no threshold detects so much
+    ours: float  # False alarms per hour; infinite if no threshold detects this share
     baseline: float
-    ratio: float  # Of ours to the baseline's, with the middle 95 % over draws of recordings
+    ratio: float  # Ours divided by the baseline's, with the central 95 % over draws of recordings
     low: float
     high: float
 
@@ -367,7 +370,7 @@ class EqualDetection:
 def operating_curve(
     trials: Sequence[Trial], said: Sequence[Decisions], rules: Iterable[Rule]
 ) -> OperatingCurve:
-    """Return the curve of some rules over all thresholds of their score."""
+    """Return the operating curve of several rules over all thresholds of their score."""
     levels = _levels(trials, said)
     rows = [
         [_counted(trial, one, rule(one.score, level)) for trial, one in zip(trials, said, strict=True)]
@@ -378,7 +381,7 @@ def operating_curve(
 
 
 def _levels(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[float]:
-    """Return thresholds from where half of the hazard-free hops are above to where none is."""
+    """Return thresholds from the median of the hazard-free scores to a value above all of them."""
     pairs = list(zip(trials, said, strict=True))
     calm = np.concatenate([one.score for trial, one in pairs if trial.hazard_free])
     near = [one.score[trial.hops.before_sight()] for trial, one in pairs if not trial.hazard_free]
@@ -391,9 +394,10 @@ def _levels(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[float]:
 def equal_detection(
     trials: Sequence[Trial], decisions: Mapping[str, Sequence[Sequence[Decisions]]], draws: IndexArray
 ) -> list[EqualDetection]:
-    """Compare the world-state's alarm with the sustained baseline, each at its best threshold, as detected.
+    """Compare the world-state's alarm with the sustained baseline, each at its best threshold.
 
-    The baseline's sustained hops are chosen with its threshold. Nothing where either was not scored.
+    The baseline's sustained hops are chosen together with its threshold. The result is empty if a method is
+    missing.
     """
     if BASELINE not in decisions or OURS not in decisions:
         return []
@@ -408,7 +412,7 @@ def _compared(
     detected: float, ours: OperatingCurve, baseline: OperatingCurve, weights: FloatArray
 ) -> EqualDetection:
     a, b = (curve.alarms_per_hour(detected, weights) for curve in (ours, baseline))
-    # On a draw without alarms, or that one of them cannot detect so much of, there is nothing to compare.
+    # A draw may have no alarms or too few detected approaches for either rule: such a draw has no ratio.
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = a / b
     shares[1:][np.isinf(shares[1:])] = np.nan
@@ -421,7 +425,7 @@ def _counted(trial: Trial, said: Decisions, alarm: BoolArray) -> dict[str, float
 
 
 def _held(score: FloatArray, threshold: float) -> BoolArray:
-    """Return the alarm of a sequence: its score is a mean over .3 s already, and it stays for a second."""
+    """Return a sequence model's alarm: its score is averaged over 0.3 s, and the alarm lasts 1 s longer."""
     return raised_at((score >= threshold).astype(float), 1.0)
 
 

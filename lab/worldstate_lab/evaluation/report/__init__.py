@@ -1,1 +1,1 @@
-"""The report of an evaluation: its contents as values, its figures, and how they become files."""
+"""The report of an evaluation: its contents as values, its figures, and the files written from them."""

@@ -1,4 +1,4 @@
-"""The report of an evaluation: its sections in order, those behind the warnings, and on what it stands."""
+"""The report of an evaluation: its sections in order, the sections after the warnings, and the data used."""
 
 import platform
 from collections import Counter
@@ -36,7 +36,7 @@ _TRANSFER = (
 _BY_SITE = (
     *("hazard_free_hours", "detection", "random_detection", "lead_s", "false_alarms_per_hour", "auroc_all"),
 )
-# Part taken away, and the row that shows it.
+# The removed part, and the row without it.
 _ABLATIONS = (
     ("everything on", "with absence .02", "ece"),
     ("(a) without absence", PROPOSED, "ece"),
@@ -44,12 +44,12 @@ _ABLATIONS = (
     ("with looming, weight from the calibration folds", "with absence .02 + looming", "ece"),
 )
 _ABLATED = ("detection", "random_detection", "lead_s", "false_alarms_per_hour", "auroc_all")
-# Rows of the paper's list that say by themselves which figure they are.
+# Groups of the paper's values whose row names are complete labels.
 _NAMED_BY_ROW = ("array bounds", "signature study", "data", "real time")
 
 
 def _group_table(name: str, title: str, measured: MeasuredValues, group: str, caption: str) -> Table:
-    """Return the paper's values of a group beside ours, a row each."""
+    """Return the paper's values of a group beside ours, one per row."""
     rows = [
         (_label(one), _ours(one, measured), printed(one), one.unit)
         for one in PAPER_VALUES
@@ -59,7 +59,7 @@ def _group_table(name: str, title: str, measured: MeasuredValues, group: str, ca
 
 
 def _label(one: PaperValue) -> str:
-    """Return condition and figure in words."""
+    """Return condition and figure as a label."""
     if one.group in _NAMED_BY_ROW:
         return one.row
     words = FIGURES[one.figure].words if one.figure in FIGURES else one.figure.replace("_", " ")
@@ -67,12 +67,12 @@ def _label(one: PaperValue) -> str:
 
 
 def _ours(one: PaperValue, measured: MeasuredValues) -> Value:
-    # With the digits of what was measured: the paper rounds 0.0883 m to 0.088.
+    # With the decimals of the measured value: the paper rounds 0.0883 m to 0.088.
     return replace(measured.at(one.group, one.row, one.figure, note=_UNMEASURED), paper=None)
 
 
 def front_end_section(measured: MeasuredValues) -> Section:
-    """Return bearings against the camera, and the bounds of the array."""
+    """Return the section on bearing errors against the camera and bounds of the array."""
     array = _group_table(
         "array",
         "What the 56-microphone array allows",
@@ -89,7 +89,7 @@ def front_end_section(measured: MeasuredValues) -> Section:
         measured,
         "front-end",
         "SRP-PHAT bearing against the nearest moving box of the camera, hops after T0; MUSIC on the same "
-        "hops; gated: the 16 % of the bearings whose peak stands out most.",
+        "hops; gated: the 16 % of the bearings with the highest prominence.",
     )
     sites = Table(
         "bearing_by_junction",
@@ -106,21 +106,21 @@ def front_end_section(measured: MeasuredValues) -> Section:
 
 
 def approach_rate_section(measured: MeasuredValues) -> Section:
-    """Return looming and tonal Doppler."""
+    """Return the section on looming and tonal Doppler."""
     table = _group_table(
         "approach_rate",
         "Approach rate in the wild",
         measured,
         "approach rate",
         "Looming AUROC: energy slope of the last 3 s before the pass against hazard-free sound. "
-        "Correlation: time to arrival read from the slope, with the true time until the pass. Doppler: "
-        "approaches with a usable tone.",
+        "Correlation: between the time to arrival computed from the slope and the true time until the pass. "
+        "Doppler: number of approaches with a usable tone.",
     )
     return Section("Approach rate", (), (table,))
 
 
 def transfer_section(measured: MeasuredValues) -> Section:
-    """Return the protocols beyond the static folds, and every junction of all of them."""
+    """Return the section on protocols other than the static folds, with every junction of all protocols."""
     parts = []
     for name, run in measured.found.runs.items():
         if name != STANDING:
@@ -132,7 +132,7 @@ def transfer_section(measured: MeasuredValues) -> Section:
 
 
 def _junctions(found: Evaluation) -> Section:
-    """Return the proposed method at every junction, by protocol."""
+    """Return the results of the proposed method at every junction, by protocol."""
     sites = {name: site_values(scores[PROPOSED], found, name) for name, scores in found.scores.items()}
     standing = [name for name in (STANDING, FIXED.name, RETRAINED.name) if name in sites]
 
@@ -165,15 +165,16 @@ def _junction_table(found: Evaluation, sites: Mapping[str, Mapping[str, Mapping[
         f"Every junction, {PROPOSED}",
         ("protocol", "junction", "recordings", *titles(_BY_SITE)),
         rows,
-        "Intervals over the recordings of the junction. A junction has few: one alarm is many an hour.",
+        "Intervals over the recordings of the junction. A junction has few recordings, so one alarm is a "
+        "high rate per hour.",
     )
 
 
 def ablation_section(measured: MeasuredValues) -> Section:
-    """Return ablations (a) and (b), looming, and the approach rate in the grounded likelihood."""
+    """Return the section on ablations (a) and (b), looming, and approach rate in the grounded likelihood."""
 
     def cell(row: str, figure: str) -> Value:
-        # Beside the paper's value stands the row of Table I, not what is left of it here.
+        # The reference here is the row of Table I and not the paper's value.
         return replace(measured.at(STANDING, row, figure, note=_UNMEASURED), paper=None)
 
     shown = (*_ABLATED, "ece", "hazard_awareness")
@@ -185,9 +186,10 @@ def ablation_section(measured: MeasuredValues) -> Section:
             (part, *(cell(row, figure) for figure in (*_ABLATED, error, "hazard_awareness")))
             for part, row, error in _ABLATIONS
         ],
-        f"{measured.found.runs[STANDING].basis} One part off at a time, same folds; vision alone is aware "
-        f"in {cell('Vision-only', 'hazard_awareness').text}. Paper: (a) changes no entry of Table I with a "
-        "clean camera; (b) ECE 0.167 raw, 0.034 calibrated; (c) is the section on degradation.",
+        f"{measured.found.runs[STANDING].basis} One part is switched off at a time, on the same folds; the "
+        f"hazard awareness of vision alone is {cell('Vision-only', 'hazard_awareness').text}. Paper: (a) "
+        "changes no entry of Table I with a clean camera; (b) ECE 0.167 raw, 0.034 calibrated; (c) is the "
+        "section on degradation.",
     )
     names = {one.name for one in GROUNDED}
     grounded = measured.table(
@@ -196,14 +198,14 @@ def ablation_section(measured: MeasuredValues) -> Section:
         _TRANSFER,
         "grounded",
         "Bearing and approach rate in the likelihood, eq. (5)",
-        "The shipped scores alone, weighed by bearing and approach rate, and without the rate. The paper "
-        "calls the last ablation vacuous, as tonal Doppler is rarely usable.",
+        "The shipped scores alone, weighted by bearing and approach rate, and without the approach rate. The "
+        "paper calls the last ablation vacuous, because tonal Doppler is rarely usable.",
     )
     return Section("Ablations", (), (table, grounded))
 
 
 def paper_section(measured: MeasuredValues) -> Section:
-    """Return every number of the paper beside ours, and the command that fills it on what it stands on."""
+    """Return every number of the paper beside ours, with the command and the data that compute it."""
     simulated = measured.found.takes.simulated
     rows = [
         (
@@ -218,10 +220,10 @@ def paper_section(measured: MeasuredValues) -> Section:
         for one in PAPER_VALUES
     ]
     text = (
-        "The recordings here are SIMULATED: where the last column names a command, the paper's number "
-        "stands on real sound or video, and what is printed here is its simulated counterpart."
+        "The recordings here are SIMULATED: if the last column contains a command, the paper's number comes "
+        "from real sound or video, and the number printed here is its simulated counterpart."
         if simulated
-        else "Numbers of real sound stand on the recordings that were given."
+        else "Numbers on real sound come from the given recordings."
     )
     table = Table(
         "paper",
@@ -229,7 +231,7 @@ def paper_section(measured: MeasuredValues) -> Section:
         ("section", "about", "figure", "paper", "unit", "here", "filled by"),
         rows,
     )
-    return Section("The paper's numbers, and what they need", (text,), (table,))
+    return Section("The paper's numbers, and the data that they require", (text,), (table,))
 
 
 def _filled(one: PaperValue, simulated: bool) -> str:
@@ -239,7 +241,7 @@ def _filled(one: PaperValue, simulated: bool) -> str:
 
 
 def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, str]] = ()) -> Document:
-    """Return the whole report; sections that nothing was measured for say so, and the options end it."""
+    """Return the whole report; sections without measured values state this, and the options come last."""
     others = {} if found.degradation is None else sweep_values(found.degradation)
     measured = MeasuredValues.of(found, others)
     panels = () if found.degradation is None else awareness_figures(found.degradation)
@@ -252,7 +254,7 @@ def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, st
         approach_rate_section(measured),
         transfer_section(measured),
         degradation_section(
-            found.degradation, found.lacking.get("degradation sweep", "not asked for"), found.staged
+            found.degradation, found.lacking.get("degradation sweep", "not requested"), found.staged
         ),
         *(section(measured) for section in (ablation_section, tracking_section, strata_section) if static),
         difference_section(found),
@@ -278,25 +280,25 @@ def _data_section(found: Evaluation) -> Section:
     if found.failed:
         failed = [(one.name, one.problem) for one in found.failed]
         blocks.append(
-            Table("skipped", "Recordings that could not be heard", ("recording", "problem"), failed)
+            Table("skipped", "Recordings that could not be processed", ("recording", "problem"), failed)
         )
     sound = (
         "Every recording is simulated: no figure of this report is a measurement on real sound, and "
         "agreement with the paper is agreement of the simulator with the paper's recordings."
         if found.takes.simulated
-        else "The figures are measured on the sound that was given."
+        else "The figures are measured on the given recordings."
     )
-    # A stratum of one is the same in every draw; nothing in the interval itself shows that.
+    # A stratum of one recording is equal in every draw, and the interval does not show it.
     strata = Counter((trial.label, trial.site) for trial in found.trials)
     single = sum(count == 1 for count in strata.values())
     intervals = (
-        f"{single} of {len(strata)} such strata hold a single recording, which every draw repeats, so "
-        "intervals are too narrow by what it would add."
+        f"{single} of {len(strata)} such strata contain a single recording, which is the same in every draw, "
+        "so the intervals are too narrow."
         if single
-        else "Every such stratum holds several."
+        else "Every such stratum contains several."
     )
-    intervals = f"Intervals draw recordings again within side and junction. {intervals}"
-    skipped = f"{len(found.failed)} recordings could not be heard and are left out of every figure."
+    intervals = f"For the intervals, recordings are resampled within side and junction. {intervals}"
+    skipped = f"{len(found.failed)} recordings could not be processed and are left out of every figure."
     return Section("What was evaluated", (sound, intervals, skipped), tuple(blocks))
 
 

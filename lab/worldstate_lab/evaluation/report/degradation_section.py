@@ -26,7 +26,7 @@ _RAIN = ("level", "noise (dB)", "lens alone", "roof alone", "rain", "if effects 
 
 
 def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
-    """Return what the paper states of the sweep, of the first detector; a larger one is the last."""
+    """Return measured values for the paper's sweep, of the first detector; a larger detector comes last."""
     first, last = study.sweeps[0], study.sweeps[-1]
     beta, clean = first.beta, (0, 0)
     values = {
@@ -43,11 +43,11 @@ def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
 
 
 def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
-    """Return panel (d) for every detector, the paper's least awareness beside it."""
+    """Return panel (d) for every detector, with the paper's lowest awareness."""
     paper = paper_value("degradation", _AWARE, "awareness_least")
     figures = []
     for number, sweep in enumerate(study.sweeps, start=1):
-        # A condition without a camera is not of a family: the line would have one point.
+        # A condition without a camera belongs to no family: its line would have one point.
         names = dict.fromkeys(row.condition.family for row in sweep.awareness.rows[1:])
         families = {
             name: [(Value(1.0 - row.vision.value), Value(*row.awareness)) for row in sweep.family(name)]
@@ -62,55 +62,55 @@ def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
 def degradation_section(
     study: DegradationStudy | None, lacking: str, staged: StreamSweep | None = None
 ) -> Section:
-    """Return miss rates and awareness of every detector, or what is lacking and what would fill them."""
+    """Return miss rates and awareness of every detector, or what is missing and how to obtain it."""
     title, streams = "Vision degradation", () if staged is None else (stream_table(staged),)
     if study is None:
-        told = f"Not run: {lacking}. On filmed recordings {COMMANDS['ovad']} fills it."
+        told = f"Not run: {lacking}. On recordings with video, {COMMANDS['ovad']} computes it."
         return Section(title, (told,), streams)
     names = " and ".join(sweep.detector for sweep in study.sweeps)
     model = study.settings.model
-    heard = "the model that ships" if model is None else f"the model {model.name}"
+    heard = "the shipped model" if model is None else f"the model {model.name}"
     text = [
         f"{len(study.approaches)} approaches and {len(study.hazard_free)} hazard-free recordings, detectors: "
-        f"{names}; heard with {heard}. Ablation (c) is this sweep.",
+        f"{names}; sound processed with {heard}. Ablation (c) is this sweep.",
         *(f"{one}." for one in study.missing),
         *(f"Left out: {name}, {why}." for name, why in study.skipped.items()),
     ]
-    # One detector agrees with itself: the sentence would claim what was not measured.
+    # With one detector there is no difference to report.
     if len(study.sweeps) > 1:
         text.append(
-            "Between the first and the last detector awareness differs by at most "
-            f"{study.largest_awareness_difference:.3f}, beta by {study.beta_shift:+.3f} in the mean."
+            "Between the first and the last detector, awareness differs by at most "
+            f"{study.largest_awareness_difference:.3f}, and beta by {study.beta_shift:+.3f} on average."
         )
     parts = tuple(_detector_section(sweep, number) for number, sweep in enumerate(study.sweeps, start=1))
     return Section(title, tuple(text), streams, parts)
 
 
 def stream_table(sweep: StreamSweep) -> Table:
-    """Return the advisories an hour in every staged state of camera and roof."""
+    """Return the advisories per hour in every staged state of camera and rain."""
     rows: list[tuple[Cell, ...]] = []
     for row in sweep.rows:
         rates = Value(*row.per_hour, digits=1), Value(row.upper_90, digits=1)
         rows.append((row.name, row.onsets, *rates, Value(*row.ratio)))
     return Table(
         "staged_streams",
-        "Advisories without hazards, while the camera fails and it rains",
+        "Advisories without hazards, with a degraded camera and rain",
         ("state", "onsets", "an hour", "at most (90 %)", "to the clean camera"),
         rows,
-        f"On {sweep.hours:.2f} h of streams without hazards; the boxes of the camera are left out as often "
-        "as the table of miss rates says, and it states how degraded it is. Ratios draw minutes, the same "
-        "for both.",
+        f"On {sweep.hours:.2f} h of streams without hazards. Boxes of the camera are removed at the rates in "
+        "the table of miss rates, and the camera reports its degradation. The ratios resample minutes, the "
+        "same for both states.",
     )
 
 
 def sweep_tables(study: DegradationStudy) -> list[Table]:
-    """Return awareness by condition and rain as a common cause, for every detector."""
+    """Return the tables of awareness by condition and of rain as a common cause, for every detector."""
     parts = enumerate(study.sweeps, start=1)
     return [table for number, sweep in parts for table in (_conditions(sweep, number), _rain(sweep, number))]
 
 
 def degradation_record(study: DegradationStudy) -> dict[str, Any]:
-    """Return everything that was found, ready for JSON; null where nothing is known."""
+    """Return all results ready for JSON; unknown values are null."""
     record: dict[str, Any] = plain(
         {
             **{name: getattr(study, name) for name in ("approaches", "hazard_free", "skipped", "missing")},
@@ -187,8 +187,8 @@ def _rain(sweep: DetectorSweep, number: int) -> Table:
         f"Rain as a common cause: awareness (share), {sweep.detector}",
         _RAIN,
         rows,
-        "Rain soils the lens and drums on the roof at once; noise over the recording's own level. "
-        "Optimism: what independent effects would leave, less what rain leaves.",
+        "Rain degrades the image and adds noise on the roof at the same time; the noise level is relative to "
+        "the recording. Optimism: awareness if the effects were independent, minus awareness in rain.",
     )
 
 

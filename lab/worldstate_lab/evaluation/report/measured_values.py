@@ -1,4 +1,4 @@
-"""Every figure of an evaluation as a value with its interval and the paper's, by place in the report."""
+"""Every figure of an evaluation with its interval and the paper's value, by place in the report."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ Place = tuple[str, str, str]  # Group, row and figure, as in `PAPER_VALUES`
 
 PROPOSED = "proposed .02"
 _FRONT_END, _LOOMING = ("front-end", "bearing in view"), ("approach rate", "looming")
-# Places of the front-end study's figures in the paper's list.
+# The front-end study's figures, by place in the paper's list.
 _STUDIED = {
     "bearing_srp_deg": (*_FRONT_END, "bearing_deg"),
     "doppler_usable": ("approach rate", "Doppler", "doppler_usable"),
@@ -39,14 +39,14 @@ _REFUSED = Value(math.nan, note="not scored: the model was not made for this sou
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredValues:
-    """An evaluation with all of its values; sections of the report are made of it."""
+    """An evaluation with all of its values, from which the sections of the report are built."""
 
     found: Evaluation
     values: Mapping[Place, Value]
 
     @classmethod
     def of(cls, found: Evaluation, others: Mapping[Place, Value]) -> "MeasuredValues":
-        """Return the values of protocols, methods, the front-end, the array and the data, and others."""
+        """Return the values of protocols, methods, front-end, array and data, and `others`."""
         values = dict(others) | dict(_data_values(found)) | dict(_array_values())
         for protocol, scores in found.scores.items():
             for method, score in scores.items():
@@ -59,12 +59,12 @@ class MeasuredValues:
         return cls(found, {place: _beside_paper(place, value) for place, value in values.items()})
 
     def at(self, *place: str, note: str = "") -> Value:
-        """Return the value at a place, NaN with a note where there is none."""
+        """Return the value at a place, or NaN with a note if there is none."""
         group, row, figure = place
         return self.values.get((group, row, figure), Value(math.nan, note=note))
 
     def methods(self, protocol: str, figures: Iterable[str] = ()) -> list[str]:
-        """Return the methods with a row of their own; given figures, those that have any of them."""
+        """Return the methods with a row in the report; given figures, only methods with any of them."""
         scored = [name for name in self.found.scores[protocol] if not name.startswith("curve")]
         every = [*scored, *self.found.refused.get(protocol, {})]
         if not figures:
@@ -80,7 +80,7 @@ class MeasuredValues:
         title: str,
         caption: str,
     ) -> Table:
-        """Return a table with a row for each method and a column for each figure."""
+        """Return a table with one row per method and one column per figure."""
         refused = self.found.refused.get(protocol, {})
         reasons = [f"Not scored: {refused[method]}." for method in methods if method in refused]
         rows = [(method, *self._cells(protocol, method, figures)) for method in methods]
@@ -95,11 +95,11 @@ class MeasuredValues:
 
 
 def score_values(score: Score, found: Evaluation, protocol: str) -> dict[str, Value]:
-    """Return every figure of one score with its interval; false alarms with the exact one."""
+    """Return every figure of one score with its interval; false alarms have the exact Poisson interval."""
     intervals = score.intervals(found.draws[protocol])
-    # The exact interval covers what drawing recordings again cannot: that no alarm was seen at all.
+    # If no alarm occurred, resampling gives an interval of zero width; the exact one remains valid.
     intervals["false_alarms_per_hour"] = intervals["false_alarms_per_hour_poisson"]
-    # A draw repeats recordings, and so its ECE lies above that of all: only the value is stated.
+    # A resample contains recordings twice, which raises its ECE: only the value itself is printed.
     intervals |= dict.fromkeys(("ece", "ece_raw", "ece_floor"), (math.nan, math.nan))
     notes = _worst_notes(score)
     return {
@@ -109,7 +109,7 @@ def score_values(score: Score, found: Evaluation, protocol: str) -> dict[str, Va
 
 
 def _worst_notes(score: Score) -> dict[str, str]:
-    """Return the worst junction of every figure; nothing where there is one alone."""
+    """Return the worst junction of every figure, or nothing if there is only one junction."""
     if len({one.site for one in score.recordings}) < 2:
         return {}
     return {
@@ -126,7 +126,8 @@ def site_values(score: Score, found: Evaluation, protocol: str) -> dict[str, dic
         sites.setdefault(one.site, []).append(row)
     values = {}
     for site, rows in sorted(sites.items()):
-        # Place i of every draw holds a recording of the stratum of i, so its junction is that of i.
+        # Element i of every draw comes from the stratum of recording i, so it has the junction of recording
+        # i.
         drawn, figures = score.draws(found.draws[protocol][:, rows]), score.figures(np.array(rows))
         values[site] = {
             name: Value(value, *middle(drawn[name]), FIGURES[name].digits)
@@ -137,7 +138,7 @@ def site_values(score: Score, found: Evaluation, protocol: str) -> dict[str, dic
 
 
 def _stated(group: str, figures: Mapping[str, Value]) -> Iterator[tuple[Place, Value]]:
-    """Yield the places at which the paper states figures of a group, with what was measured."""
+    """Yield the places at which the paper states figures of a group, with our measured values."""
     for one in PAPER_VALUES:
         if one.group == group and one.figure in figures:
             yield (group, one.row, one.figure), figures[one.figure]
@@ -188,7 +189,7 @@ def _front_end_values(study: FrontEndStudy) -> Iterator[tuple[Place, Value]]:
 
 
 def _derived_values(values: Mapping[Place, Value], found: Evaluation) -> Iterator[tuple[Place, Value]]:
-    """Yield what the paper states as differences, worst cases or counts over the figures."""
+    """Yield values that the paper states as differences, worst cases or counts of figures."""
     if STANDING in found.runs:
         yield ("static", "against the sustained rule", "fewer_false_alarms"), _fewer(found)
         early = seen_early_s(found.runs[STANDING].trials)
@@ -207,7 +208,7 @@ def _derived_values(values: Mapping[Place, Value], found: Evaluation) -> Iterato
 
 
 def _fewer(found: Evaluation) -> Value:
-    """Return the share of false alarms that the proposed method saves, on the same draws of recordings."""
+    """Return the share of false alarms that the proposed method avoids, on the same draws of recordings."""
     every = np.vstack([np.arange(len(found.runs[STANDING].trials)), found.draws[STANDING]])
     ours, others = (
         found.scores[STANDING][method].draws(every)["false_alarms_per_hour"]
@@ -220,7 +221,7 @@ def _fewer(found: Evaluation) -> Value:
 def _seed_range(found: Evaluation) -> Iterator[tuple[Place, Value]]:
     counts = found.scores[STANDING][PROPOSED].counts
     shares = counts["detected"].sum(axis=1) / counts["approaches"].sum(axis=1)
-    note = "" if len(found.runs[STANDING].seeds) > 1 else "one seed; --full draws five"
+    note = "" if len(found.runs[STANDING].seeds) > 1 else "one seed; --full uses five"
     for name, share in (("detection_least", shares.min()), ("detection_most", shares.max())):
         yield ("static", f"{PROPOSED}, least and most over five seeds", name), Value(float(share), note=note)
 
@@ -231,5 +232,5 @@ def _beside_paper(place: Place, value: Value) -> Value:
 
 
 def printed(one: PaperValue) -> Value:
-    """Return a number of the paper as the paper prints it."""
+    """Return a number of the paper with the paper's rounding."""
     return Value(one.value, one.low, one.high, one.digits)

@@ -1,4 +1,4 @@
-"""Panels of calibrated cueing: ROC by horizon, reliability, operating curve; what all panels share."""
+"""Panels on calibrated cueing: ROC by horizon, reliability, operating curve; helpers of all panels."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 
-# A curve of more points than this looks the same at 600 pixels, and its CSV takes megabytes.
+# At a width of 600 pixels more points are not visible, and the CSV would take megabytes.
 MOST_POINTS = 200
 GREY = "0.55"
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
@@ -24,7 +24,7 @@ PROPOSED_COLOUR, *COLOURS = CATEGORIES
 
 
 def legend_below(canvas: "Canvas", columns: int = 2) -> None:
-    """Put one legend below all axes, where it hides no data, each label once."""
+    """Put one legend below all axes, outside the data, with each label once."""
     found = [axes.get_legend_handles_labels() for axes in canvas.axes]
     once = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}
     if once:
@@ -32,20 +32,20 @@ def legend_below(canvas: "Canvas", columns: int = 2) -> None:
 
 
 def thinned(*columns: FloatArray) -> tuple[FloatArray, ...]:
-    """Return evenly spaced rows of curves that have too many, ends included."""
+    """Return evenly spaced rows of curves with too many points, both ends included."""
     n = len(columns[0])
     kept = np.unique(np.linspace(0, n - 1, min(n, MOST_POINTS)).astype(int)) if n else np.arange(0)
     return tuple(column[kept] for column in columns)
 
 
 def mark_chance(axes: "Axes") -> None:
-    """Draw the diagonal: chance of a ROC, perfect calibration of a reliability curve."""
+    """Draw the diagonal: chance level of a ROC, perfect calibration of a reliability curve."""
     axes.plot([0.0, 1.0], [0.0, 1.0], color=GREY, linewidth=0.8, zorder=0)
     axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.02))
 
 
 def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return false- and true-positive rates at every threshold, from 0 to 1, shape (k,) each.
+    """Return false-positive and true-positive rates at every threshold, from 0 to 1, shape (k,) each.
 
     Examples
     --------
@@ -62,10 +62,10 @@ def roc_curve(positives: FloatArray, negatives: FloatArray) -> tuple[FloatArray,
 
 
 def roc_figure(hazards: Mapping[str, FloatArray], free: FloatArray, areas: Mapping[str, Value]) -> Figure:
-    """Draw the ROC of hazard windows against hazard-free ones, one curve a horizon.
+    """Draw the ROC of hazard windows against hazard-free windows, one curve per horizon.
 
-    `hazards` holds the statistic of the windows by horizon, `free` that of hazard-free windows, `areas` the
-    area of each horizon beside the paper's.
+    `hazards` contains the statistic of the windows by horizon, `free` that of hazard-free windows, `areas`
+    the area by horizon with the paper's value.
     """
     curves = {name: thinned(*roc_curve(scores, free)) for name, scores in hazards.items() if scores.size}
 
@@ -80,7 +80,7 @@ def roc_figure(hazards: Mapping[str, FloatArray], free: FloatArray, areas: Mappi
     rows = [(name, *point) for name, curve in curves.items() for point in zip(*curve, strict=True)]
     return Figure(
         "cueing_roc",
-        "(a) Windows told apart, by time to line of sight",
+        "(a) ROC of windows, by time to line of sight",
         "ROC of the hazard statistic: windows of occluded approaches that end within the horizon before T0 "
         "against hazard-free windows. Area with its 95 % interval; the grey diagonal is chance.",
         draw,
@@ -92,9 +92,9 @@ def roc_figure(hazards: Mapping[str, FloatArray], free: FloatArray, areas: Mappi
 def reliability_figure(
     risks: Mapping[str, FloatArray], labels: BoolArray, errors: Mapping[str, Value]
 ) -> Figure:
-    """Draw the observed share of hazards over what was predicted, by reading (raw, calibrated).
+    """Draw the observed share of hazards over the predicted one, raw and calibrated.
 
-    `risks` holds the probabilities by reading, each as long as `labels`; `errors` their ECE.
+    `risks` contains the raw and calibrated probabilities, each as long as `labels`; `errors` their ECE.
     """
     curves = {name: reliability_curve(values, labels) for name, values in risks.items()}
 
@@ -124,7 +124,7 @@ def reliability_figure(
         "cueing_reliability",
         "(b) Reliability of the stated probability",
         f"Ten equal bins, held-out folds, {labels.mean():.0%} of the windows are hazards. "
-        "Below: windows in each bin. On the diagonal a probability means what it says.",
+        "Below: number of windows in each bin. On the diagonal, the probabilities are calibrated.",
         draw,
         ("reading", "predicted", "observed", "windows"),
         rows,
@@ -134,7 +134,7 @@ def reliability_figure(
 
 @dataclass(frozen=True, slots=True)
 class OperatingPoint:
-    """One method on the plane of detection and false alarms; `alpha` where it is one of the curve."""
+    """Detection and false alarms of one method; `alpha` is set for points of the curve."""
 
     name: str
     false_alarms_per_hour: Value
@@ -143,7 +143,7 @@ class OperatingPoint:
 
 
 def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) -> Figure:
-    """Draw detection against achieved false alarms an hour: the curve over alpha, the others as points."""
+    """Draw detection over achieved false alarms per hour: the curve over alpha, other methods as points."""
 
     def draw(canvas: "Canvas") -> None:
         _draw_operating(canvas, points, max(quantum_per_hour, 1e-3))
@@ -152,7 +152,7 @@ def operating_figure(points: Sequence[OperatingPoint], quantum_per_hour: float) 
         "cueing_operating",
         "(c) Detection against achieved false alarms",
         f"Bars are 95 % intervals; open marks are the paper's. One alarm onset is {quantum_per_hour:.3g} "
-        "an hour: left of it the axis is linear, right of it logarithmic.",
+        "per hour: left of it the axis is linear, right of it logarithmic.",
         draw,
         ("method", "alpha", "detection", "false_alarms_per_hour"),
         [(one.name, one.alpha, one.detection, one.false_alarms_per_hour) for one in points],
@@ -164,7 +164,7 @@ def _draw_operating(canvas: "Canvas", points: Sequence[OperatingPoint], linear: 
     curve = sorted((one for one in points if one.alpha is not None), key=lambda one: one.alpha or 0.0)
     others = [one for one in points if one.alpha is None]
     axes = canvas.subplots()
-    # The hour has few alarms: between none and one onset the axis is linear, above it logarithmic.
+    # Few alarms occur per hour: the axis is linear from zero to one onset and logarithmic above.
     axes.set_xscale("symlog", linthresh=linear)
     line = [(one.false_alarms_per_hour.value, one.detection.value) for one in curve]
     if line:
@@ -193,7 +193,7 @@ def _beside(value: Value) -> str:
 
 
 def _mark(canvas: "Canvas", one: OperatingPoint, colour: str, mark: str, label: str) -> None:
-    """Draw a point with its two intervals, and the paper's as an open mark of the same shape."""
+    """Draw a point with its two intervals, and the paper's value as an open mark of the same shape."""
     axes = canvas.axes[0]
     x, y = one.false_alarms_per_hour, one.detection
     if not np.isfinite([x.value, y.value]).all():

@@ -1,4 +1,4 @@
-"""Panels over recordings, junctions and states of the camera: leads, bearings, miss rates, awareness."""
+"""Panels over recordings, junctions and camera states: lead times, bearings, miss rates, awareness."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-# A median of fewer bearings is not drawn.
+# Smallest number of bearings for which a median is drawn.
 FEWEST = 10
 
 
 def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float]) -> Figure:
-    """Draw the lead time of every detected approach, one row a method; NaN is an approach not detected."""
+    """Draw the lead time of every detected approach, one row per method; NaN is an undetected approach."""
     names = [name for name, leads in leads_s.items() if np.isfinite(leads).any()]
 
     def draw(canvas: "Canvas") -> None:
         axes = canvas.subplots()
         for row, name in enumerate(names):
             leads = np.sort(leads_s[name][np.isfinite(leads_s[name])])
-            # Spread by rank, not at random: the picture of the same numbers stays the same.
+            # Spread by rank and not at random, so that equal numbers give the same picture.
             spread = row + 0.28 * (np.arange(leads.size) % 5 - 2) / 2
             axes.plot(leads, spread, ".", color=CATEGORIES[0], alpha=0.55, ms=4)
             axes.plot(leads.mean(), row, "|", color="black", ms=17, mew=2.0, label="mean of the detected")
@@ -59,8 +59,8 @@ def lead_figure(leads_s: Mapping[str, FloatArray], paper_s: Mapping[str, float])
     return Figure(
         "lead_times",
         "Lead time of every detected approach",
-        "One dot an approach and seed of the folds: line-of-sight entry minus the first alarm within the 5 s "
-        "before it. The number of detected approaches stands below the name; methods that detect none are "
+        "One dot per approach and seed of the folds: line-of-sight entry minus the first alarm in the 5 s "
+        "before it. The number of detected approaches is below the name; methods that detect none are "
         "left out. An empty cell of the CSV is an approach that was not detected.",
         draw,
         ("method", "lead_s"),
@@ -76,12 +76,12 @@ def junction_figure(
     values: Mapping[str, Mapping[str, Value]],
     worst: Literal["low", "high"],
 ) -> Figure:
-    """Draw a figure by junction, one colour a method, the worst junction of each ringed.
+    """Draw a figure by junction, one colour per method, with a ring around the worst junction of each method.
 
-    `values` holds junction to value by method; `worst` says whether the lowest or the highest is the worst.
+    `values` maps method and junction to a value; `worst` is "low" or "high", the worse end.
     """
     sites = sorted({site for one in values.values() for site in one})
-    # Side by side within the row of a junction, at most .3 of it up or down.
+    # Side by side within the row of a junction, offset by at most 0.3 rows.
     offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else np.zeros(1)
 
     def draw(canvas: "Canvas") -> None:
@@ -115,7 +115,7 @@ def junction_figure(
 
 
 def bearing_gating_figure(checks: HopTable) -> Figure:
-    """Draw the median bearing error over the share of bearings kept by prominence."""
+    """Draw the median bearing error over the share of bearings with the highest prominence."""
     curve, n = bearing_curve(checks), int(np.isfinite(checks.error_rad).sum())
     points: tuple[FloatArray, ...] = ()
     if not isinstance(curve, NotUsable):
@@ -134,8 +134,9 @@ def bearing_gating_figure(checks: HopTable) -> Figure:
     return Figure(
         "bearing_gating",
         "Bearing error, gated by prominence",
-        "Median absolute error of the bearings whose peak stands out most, over the share kept; windows "
-        "with a moving box in view. Open circles: the paper's 3.4 degrees on all and 2.4 on 16 %.",
+        "Median absolute error of the bearings with the highest prominence, over the share kept; windows "
+        "with a moving box in view. Open circles: the paper's 3.4 degrees for all bearings and 2.4 degrees "
+        "for 16 % of them.",
         draw,
         ("share_kept", "median_error_deg", "prominence"),
         [tuple(map(float, row)) for row in zip(*points, strict=True)],
@@ -143,7 +144,7 @@ def bearing_gating_figure(checks: HopTable) -> Figure:
 
 
 def miss_rate_level_figure(families: Mapping[str, Sequence[tuple[str, Value]]]) -> Figure:
-    """Draw beta over the level, one line a family; `families` holds (d as text, beta), clean first."""
+    """Draw beta over the level, one line per family; `families` contains (d as text, beta), clean first."""
     levels = [level for level, _ in next(iter(families.values()), ())]
 
     def draw(canvas: "Canvas") -> None:
@@ -166,7 +167,7 @@ def miss_rate_level_figure(families: Mapping[str, Sequence[tuple[str, Value]]]) 
 
 
 def miss_rate_angle_figure(states: Mapping[str, Sequence[Value]], edges_deg: Sequence[float]) -> Figure:
-    """Draw beta over |azimuth|, one line a state of the camera; one value between two edges."""
+    """Draw beta over |azimuth|, one line per camera state; each value is for one interval of angles."""
     middle = 0.5 * (np.asarray(edges_deg)[1:] + np.asarray(edges_deg)[:-1])
 
     def draw(canvas: "Canvas") -> None:
@@ -174,15 +175,15 @@ def miss_rate_angle_figure(states: Mapping[str, Sequence[Value]], edges_deg: Seq
         _bands(axes, {name: (middle, values) for name, values in states.items()})
         axes.set(xlabel="angle off boresight |azimuth| (deg)", ylabel=r"miss rate $\beta$")
         axes.set(ylim=(-0.02, 1.02), xlim=(edges_deg[0], edges_deg[-1]))
-        # The last edge is that of the view, such as 35.19 degrees.
+        # The last edge is that of the field of view, such as 35.19 degrees.
         axes.set_xticks(list(edges_deg), [f"{edge:.0f}" for edge in edges_deg])
         legend_below(canvas)
 
     return Figure(
         "miss_rate_angle",
         "Miss rate of the camera by angle",
-        "As before, by the angle between the vehicle and the optical axis. The paper, clean camera: 0.04 at "
-        "boresight, 0.14 at 20 to 30 degrees.",
+        "The same share by the angle between the vehicle and the optical axis. The paper, clean camera: 0.04 "
+        "at boresight, 0.14 at 20 to 30 degrees.",
         draw,
         ("state", "from_deg", "to_deg", "miss_rate"),
         [
@@ -194,9 +195,9 @@ def miss_rate_angle_figure(states: Mapping[str, Sequence[Value]], edges_deg: Seq
 
 
 def awareness_figure(families: Mapping[str, Sequence[tuple[Value, Value]]], paper_least: float) -> Figure:
-    """Draw hazard awareness over the measured miss rate beta, one line a family of degradations.
+    """Draw hazard awareness over the measured miss rate beta, one line per family of degradations.
 
-    `families` holds (beta, awareness) by level, the clean camera first.
+    `families` contains (beta, awareness) by level, the clean camera first.
     """
 
     def draw(canvas: "Canvas") -> None:
@@ -213,9 +214,9 @@ def awareness_figure(families: Mapping[str, Sequence[tuple[Value, Value]]], pape
 
     return Figure(
         "cueing_awareness",
-        "(d) Hazard awareness while the camera fails",
-        "Share of the hops after T0 in which the vehicle is seen or reported, over the share that the camera "
-        "misses; level 0 is the clean camera. Bands are 95 % intervals over recordings.",
+        "(d) Hazard awareness with a degraded camera",
+        "Share of the hops after T0 in which the vehicle is detected or announced, over the share that the "
+        "camera misses; level 0 is the clean camera. Bands are 95 % intervals over recordings.",
         draw,
         ("family", "level", "miss_rate", "awareness"),
         [
@@ -228,7 +229,7 @@ def awareness_figure(families: Mapping[str, Sequence[tuple[Value, Value]]], pape
 
 
 def _bands(axes: "Axes", lines: Mapping[str, tuple[FloatArray | IntArray, Sequence[Value]]]) -> None:
-    """Draw a line with its band of intervals for each name."""
+    """Draw a line with a band of intervals for each name."""
     for (name, (x, values)), mark in zip(lines.items(), MARKS, strict=False):
         (line,) = axes.plot(x, [v.value for v in values], marker=mark, ms=4, label=name)
         low, high = [v.low for v in values], [v.high for v in values]
@@ -239,17 +240,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-# The paper's first image is 2.5 s before line-of-sight entry, with the vehicle still behind the corner.
+# The paper's first image is 2.5 s before line-of-sight entry, when the vehicle is still behind the corner.
 HIDDEN_S = 2.5
-# Three images side by side at 150 dots an inch are 440 pixels wide each; more is not seen.
+# Three images side by side at 150 dots per inch are 440 pixels wide each; a higher resolution is not visible.
 _IMAGE_PX = 480
-# An advisory holds until the next decision.
+# An advisory lasts until the next decision.
 _HOP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ApproachImage:
-    """One camera image, what it shows, and where the vehicle is: a box, or the column of a hidden one."""
+    """One camera image, its caption, and the place of the vehicle: a box, or a column if it is hidden."""
 
     title: str
     image: ImageArray  # shape (height, width, 3), red first
@@ -258,7 +259,7 @@ class ApproachImage:
 
 
 def approach_section(found: Evaluation) -> Section:
-    """Return the timeline of the detected approach whose lead is the median one, filmed ones preferred."""
+    """Return the timeline of the detected approach with the median lead time, with video if possible."""
     title, run = "One approach end to end", found.runs[STANDING]
     answers = run.decisions[PROPOSED][0]
     leads = leads_s(run.trials, [answers])
@@ -271,18 +272,18 @@ def approach_section(found: Evaluation) -> Section:
         return Section(title, ("No approach was detected by the proposed method.",))
     middle = chosen[np.argsort(leads[chosen], kind="stable")[(chosen.size - 1) // 2]]
     trial, said = pairs[middle]
-    # Without OpenCV, or with a video that cannot be read, the rest of the figure stays.
+    # If OpenCV is not installed or the video cannot be read, the rest of the figure is drawn.
     images: tuple[ApproachImage, ...] = ()
     with suppress(WorldstateError):
         images = approach_images(videos[trial.name], trial)
     name = f"Approach {trial.name} at {trial.site}, from the {trial.label}"
     figure = approach_figure(f"{name}: lead {leads[middle]:.1f} s (paper's: 2.3 s)", trial, said, images)
-    text = f"The approach with the median lead of the {detected.size} that {PROPOSED} detects."
+    text = f"The approach with the median lead time of the {detected.size} that {PROPOSED} detects."
     return Section(title, (text,), (figure,))
 
 
 def leads_s(trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> FloatArray:
-    """Return the lead of every approach and seed, NaN where it was not detected."""
+    """Return the lead time of every approach and seed, NaN if it was not detected."""
     leads = [
         onset_outcome(said.time_s[rising_edges(said.alarm)], trial.t0_s).lead_s
         for answers in passes
@@ -295,8 +296,8 @@ def leads_s(trials: Sequence[Trial], passes: Sequence[Sequence[Decisions]]) -> F
 def approach_figure(
     title: str, trial: Trial, said: Decisions, images: Sequence[ApproachImage] = ()
 ) -> Figure:
-    """Draw an approach as the paper's timeline figure does; without images their row is left out."""
-    # Before the first hop a parked car cannot be told from a moving one.
+    """Draw an approach like the paper's timeline figure; without images their row is omitted."""
+    # Before the first hop, parked and moving cars cannot be distinguished.
     moving = trial.boxes.moving.astype(bool) & (trial.boxes.time_s >= said.time_s[0])
     seen_s = trial.boxes.time_s[moving]
 
@@ -308,7 +309,7 @@ def approach_figure(
         _draw_statistic(canvas.add_subplot(grid[rows - 1, :]), trial.t0_s, said, seen_s)
         legend_below(canvas, columns=5)
 
-    # A box that came between two hops belongs to the later one, which is the first to have it.
+    # A box between two hops belongs to the later one, which is the first that can use it.
     at = np.searchsorted(said.time_s - 1e-6, seen_s)
     boxes = np.bincount(at, minlength=said.time_s.size + 1)[: said.time_s.size]
     camera = (
@@ -386,7 +387,7 @@ def _box_at(boxes: HopTable, time_s: float) -> FloatArray | None:
 
 
 def _column_at(truth: HopTable, time_s: float, camera: PinholeCamera) -> float | None:
-    """Return the column of the true direction, None where it is outside the view or unknown."""
+    """Return the image column of the true direction, or None if it is outside the view or unknown."""
     if not len(truth):
         return None
     row = int(np.abs(truth.time_s - time_s).argmin())
@@ -400,7 +401,7 @@ def _draw_image(axes: "Axes", shown: ApproachImage) -> None:
     axes.imshow(shown.image)
     if shown.box_px is not None:
         x1, y1, x2, y2 = shown.box_px
-        # Two strokes, so that the box shows on dark and on bright images.
+        # Two strokes make the box visible on dark and on bright images.
         for colour, style in (("white", "-"), (IN_VIEW, (0, (3, 2)))):
             box = Rectangle(
                 (x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linestyle=style, linewidth=1.6
@@ -416,11 +417,11 @@ def _draw_image(axes: "Axes", shown: ApproachImage) -> None:
 def _draw_statistic(axes: "Axes", t0_s: float, said: Decisions, seen_s: FloatArray) -> None:
     axes.plot(said.time_s, said.score, color=HIDDEN, label="statistic $s(t)$")
     if said.threshold.size and np.isfinite(said.threshold).all():
-        # One for all hops is the rule's; the product's changes from hop to hop.
+        # A rule has one threshold for all hops; the threshold of the shipped model changes between hops.
         label = rf"$\gamma(\alpha={ALPHA:g})$" if said.threshold.size == 1 else "threshold"
         level = np.broadcast_to(said.threshold, said.time_s.shape)
         axes.plot(said.time_s, level, color=DECISION, linestyle=":", label=label)
-    # Advisory and boxes stand above the range of the statistic, where they cover nothing of it.
+    # Advisory and boxes are drawn above the range of the statistic, so that they do not cover it.
     top = max(1.0, float(np.nanmax(said.score, initial=0.0)))
     bars = [(t, _HOP_S) for t in said.time_s[said.alarm]]
     axes.broken_barh(bars, (1.05 * top, 0.1 * top), color=DECISION, lw=0, label="advisory")

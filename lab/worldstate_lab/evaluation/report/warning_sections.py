@@ -17,7 +17,7 @@ from .panels import OperatingPoint, operating_figure, reliability_figure, roc_fi
 from .recording_panels import lead_figure, leads_s
 
 _BUDGETS = {f"proposed {text}": float(text) for text in (".01", ".02", ".05")}
-# The figures that a table shows of each method.
+# Columns of the tables of methods.
 _WARNING = (
     *("lead_s", "detection", "random_detection", "false_alarms_per_hour", "advisory_share", "side_correct"),
     *("bearing_deg", "lead_missed_zero_s", "early_onsets_per_approach"),
@@ -29,7 +29,7 @@ _TRACKING = (
     *("track_latency_s", "azimuth_error_deg", "gospa_deg"),
     *("visible_error_s", "visible_error_constant_s", "visible_coverage"),
 )
-# By condition of the paper's section VIII: clear is after T0 with the vehicle in view, occluded before T0.
+# By condition of the paper's section VIII: clear is after T0 with the vehicle in view, occluded is before T0.
 _STRATA = ("hazard_awareness", "bearing_deg", "detection", "random_detection", *_AREAS)
 _BUDGET = ("false_alarms_per_hour", "detection", "random_detection", "lead_s")
 _PAIRS = (
@@ -56,11 +56,11 @@ def table_i(measured: MeasuredValues) -> Section:
         _WARNING,
         "table_i",
         "Table I: warning performance, standing ego",
-        "Each cell: value, 95 % interval over recordings (of false alarms the exact Poisson interval), the "
+        "Each cell: value, 95 % interval over recordings (for false alarms the exact Poisson interval), the "
         "worst junction and its value, the paper's value. Lead: mean of line-of-sight entry T0 minus the "
-        "first alarm in the 5 s before it, detected approaches only. Random alarms: what as many alarms at "
-        "random moments would detect. The folds are those of the protocol; thresholds are set on the other "
-        "folds.",
+        "first alarm in the 5 s before it, detected approaches only. Random alarms: the share that as many "
+        "alarms at random moments would detect. The folds are those of the protocol; thresholds are set on "
+        "the other folds.",
     )
     run = measured.found.runs[STANDING]
     every = {name: leads_s(run.trials, passes) for name, passes in run.decisions.items() if name in _LEADS}
@@ -68,9 +68,9 @@ def table_i(measured: MeasuredValues) -> Section:
     stated = {method: paper_value(STANDING, method, "lead_s") for method in leads}
     text = (
         f"False alarms are counted on {hours.number} h of hazard-free time, so one alarm onset is "
-        f"{quantum.number} an hour (paper: 0.103 h, 9.7 an hour).",
+        f"{quantum.number} per hour (paper: 0.103 h, 9.7 per hour).",
         f"Vision only: a moving box precedes T0 in {early.number} {early.note} approaches (paper: 3 of 42, "
-        "put down to the tolerance of the T0 annotation and printed as 0).",
+        "attributed to the tolerance of the T0 annotation and printed as 0).",
     )
     figure = lead_figure(leads, {method: one.value for method, one in stated.items() if one})
     return Section("Table I", text, (table, figure))
@@ -89,7 +89,7 @@ _LEADS = (
 
 
 def budget_section(measured: MeasuredValues) -> Section:
-    """Return the map from alpha to false alarms an hour, of section VII."""
+    """Return the section on false alarms per hour as a function of alpha (section VII of the paper)."""
     rows: list[tuple[Cell, ...]] = []
     budgets = {alpha: method for method, alpha in _BUDGETS.items()}
     for alpha in CURVE_ALPHAS:
@@ -106,14 +106,13 @@ def budget_section(measured: MeasuredValues) -> Section:
         ("alpha (share of windows)", *titles(_BUDGET)),
         rows,
         f"{measured.found.runs[STANDING].basis} alpha bounds the share of hazard-free windows in alarm on "
-        "the calibration folds; the alarms an hour are counted on the folds that were not used. Intervals "
-        "as in Table I.",
+        "the calibration folds; the alarms per hour are counted on the test folds. Intervals as in Table I.",
     )
     return Section("Budget and false alarms", (), (table, equal_table(measured.found, STANDING)))
 
 
 def equal_table(found: Evaluation, protocol: str) -> Table:
-    """Return what the world-state and the sustained baseline cost where both detect as much."""
+    """Return the false alarms of the world-state and the sustained baseline at equal detection."""
     rows: list[tuple[Cell, ...]] = []
     for one in found.equal.get(protocol, ()):
         rates = (Value(rate, digits=0) for rate in (one.ours, one.baseline))
@@ -123,13 +122,14 @@ def equal_table(found: Evaluation, protocol: str) -> Table:
         "False alarms at equal detection",
         ("detected (share)", "world-state (1/h)", "published, sustained (1/h)", "ratio"),
         rows,
-        f"{found.runs[protocol].basis} The least false alarms at which each detects so much, over all "
-        "thresholds, which are read from these recordings, and for the baseline over its sustained hops.",
+        f"{found.runs[protocol].basis} The lowest false-alarm rate at which each method detects this share, "
+        "over all thresholds, which are chosen on these recordings; for the baseline also over its "
+        "sustained hops.",
     )
 
 
 def cueing_section(measured: MeasuredValues, awareness: Sequence[Figure]) -> Section:
-    """Return the four panels of calibrated cueing; the last one comes with the degradation study."""
+    """Return the four panels on calibrated cueing; the last one needs the degradation study."""
     run = measured.found.runs[STANDING]
     pairs = [
         (trial, said)
@@ -151,9 +151,10 @@ def cueing_section(measured: MeasuredValues, awareness: Sequence[Figure]) -> Sec
         _CALIBRATION,
         "calibration",
         "Discrimination and calibration of windows",
-        "ECE over ten equal bins at the recordings' own share of hazard windows, beside what perfectly "
-        "calibrated labels would score with as many windows; it has no interval, as drawing recordings again "
-        "only raises it. Raw: the statistic read as a probability, where it is between 0 and 1.",
+        "ECE over ten equal bins at the recordings' own share of hazard windows, with the value that "
+        "perfectly calibrated labels would have with as many windows; it has no interval, because "
+        "resampling recordings only raises it. Raw: the statistic taken as a probability, if it is between "
+        "0 and 1.",
     )
     operating = operating_figure(_points(measured), measured.at(STANDING, PROPOSED, "quantum_per_hour").value)
     return Section(
@@ -189,21 +190,21 @@ def _points(measured: MeasuredValues) -> list[OperatingPoint]:
 
 
 def tracking_section(measured: MeasuredValues) -> Section:
-    """Return identities, LOCATA's measures, GOSPA and time to visible of the methods that state any."""
+    """Return identities, LOCATA's measures, GOSPA and time to visible of the methods that have any."""
     table = measured.table(
         STANDING,
         measured.methods(STANDING, _TRACKING),
         _TRACKING,
         "tracking",
         "Tracks and time to visible, standing ego",
-        "GOSPA on bearing with a cut-off of 60 degrees, mean over hops with a vehicle. Time to visible "
-        "beside the constant that fits these approaches best, which is set on them.",
+        "GOSPA on bearing with a cut-off of 60 degrees, mean over hops with a vehicle. Time to visible: "
+        "compared with the constant that fits best, which is computed from these approaches.",
     )
     return Section("Tracking measures", (), (table,))
 
 
 def strata_section(measured: MeasuredValues) -> Section:
-    """Return the figures by condition: clear and occluded; a degraded camera has its own section."""
+    """Return the figures by condition, clear and occluded; a degraded camera has its own section."""
     table = measured.table(
         STANDING,
         measured.methods(STANDING),
@@ -232,7 +233,7 @@ def difference_section(found: Evaluation) -> Section:
         "Differences between methods",
         ("protocol", "recordings", "difference", *titles(_COMPARED)),
         rows,
-        "First method less the second on the same recordings, with the middle 95 % over the same draws of "
-        "them: an interval that leaves out 0 is a difference that these recordings show.",
+        "First method minus the second on the same recordings, with the central 95 % over the same draws: "
+        "if an interval excludes 0, these recordings show a difference.",
     )
     return Section("Paired differences", (), (table,))
