@@ -1,1 +1,1 @@
-"""Real recordings of a corner, heard from end to end: OVAD's static test set in a layout of its own."""
+"""The full chain on real recordings of street corners: OVAD's static test set in its own file layout."""

@@ -1,4 +1,4 @@
-"""What the camera, its miss rates and eq. (5) are worth on real recordings, and awareness by state."""
+"""Effect of the camera, its miss rates and eq. (5) on real recordings, and awareness by camera state."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -30,7 +30,7 @@ from worldstate_lab.metrics.intervals import deal_folds, draw_weights, middle, r
 from .hearing import Chain, heard
 from .recordings import CornerRecording
 
-# A camera that is trusted fully misses nothing; of a rate of zero the logarithm would be infinite.
+# Miss rate of a fully trusted camera; at a rate of zero the logarithm would be infinite.
 _NEVER = 1e-6
 TRUSTED = MissRates(
     (0.0, 90.0), {"trusted": FamilyCounts(((1e9,) * 5,), ((0.0,) * 5,), (1e3,) * 5, (0.0,) * 5)}
@@ -46,7 +46,7 @@ def corner_rows(
     seed: int,
     jobs: int = 1,
 ) -> dict[str, dict[str, Figures]]:
-    """Return the rows of the paper's statistic and of the product with one camera, by what they change."""
+    """Return the ablation rows of the paper's statistic and of the shipped system with one camera."""
     last_s = last_seen_s(recordings, chain)
     chains = variants(chain, measured, degradation)
     made = {name: corner_streams(one, recordings, last_s, jobs) for name, one in chains.items()}
@@ -59,11 +59,11 @@ def corner_rows(
 
 
 def variants(chain: Chain, measured: MissRates | None, degradation: float) -> dict[str, Chain]:
-    """Return the product with one thing changed at a time; with measured rates it is given d, too."""
+    """Return the system with one change at a time; with measured miss rates it also receives d."""
     grounded = replace(chain.settings, grounding=Grounding())
     found = {"product": chain, "product, vision trusted": replace(chain, miss_rates=TRUSTED)}
     if chain.boxes == "boxes":
-        # Without a camera its state does not matter, and eq. (5) is about the sound.
+        # Without a camera, its degradation has no effect; eq. (5) concerns only the sound.
         found["product, no camera"] = replace(chain, boxes=None)
         found["product, eq. (5)"] = replace(chain, settings=grounded)
     if measured is not None:
@@ -74,7 +74,7 @@ def variants(chain: Chain, measured: MissRates | None, degradation: float) -> di
 def corner_streams(
     chain: Chain, recordings: Sequence[CornerRecording], last_seen_s: Mapping[str, float], jobs: int = 1
 ) -> list[HopTable]:
-    """Hear recordings; column `there` says up to when the vehicle is in view, by the clean boxes."""
+    """Process recordings; the column `there` marks hops until the vehicle leaves the view (clean boxes)."""
     heard_hops = in_processes(partial(_stream, chain), recordings, jobs)
     return [_with_truth(one, last_seen_s[one.name]) for one in heard_hops]
 
@@ -89,7 +89,7 @@ def _with_truth(hops: HopTable, last_s: float) -> HopTable:
 
 
 def last_seen_s(recordings: Sequence[CornerRecording], chain: Chain) -> dict[str, float]:
-    """Return when the clean boxes show the vehicle of each approach for the last time; T0 where never."""
+    """Return the time of the last clean box of each approach's vehicle, or T0 if there is none."""
     found = {}
     for one in recordings:
         vision = replace(chain, boxes="boxes").source(one).camera_channel()
@@ -103,7 +103,7 @@ def last_seen_s(recordings: Sequence[CornerRecording], chain: Chain) -> dict[str
 def statistic_rows(
     streams: Sequence[HopTable], prior: Sequence[float], seed: int, switches: AblationSwitches
 ) -> dict[str, AblationRow]:
-    """Return the rows of the paper's statistic: each part off, the camera trusted fully, eq. (5) on."""
+    """Return the rows of the paper's statistic: each part off, the camera fully trusted, eq. (5) on."""
     trusted = [one.replace(miss_rate=np.full(len(one), _NEVER)) for one in streams]
     changed = {
         "vision_trusted": trusted,
@@ -118,11 +118,11 @@ def statistic_rows(
 
 
 def product_row(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float = 0.02) -> Figures:
-    """Return what the published states of recordings are worth.
+    """Return the figures of the published states of recordings.
 
-    `aware` is the share of the hops from T0 to the last image with the vehicle in which an object is seen, or
-    P(hidden) + P(visible) is above the threshold that a share alpha of hazard-free hops reaches, five folds;
-    `vision_only` is the share in which an object is seen.
+    `aware` is the share of the hops from T0 to the last image with the vehicle in which an object is
+    detected, or P(hidden) + P(visible) is above the threshold that a share alpha of hazard-free hops exceeds
+    (five folds). `vision_only` is the share in which an object is detected.
     """
     approaches = [one for one in streams if not one.hazard_free]
     free = [one for one in streams if one.hazard_free]
@@ -148,7 +148,7 @@ def product_row(streams: Sequence[HopTable], rng: np.random.Generator, alpha: fl
 def _aware_of(
     approaches: Sequence[HopTable], aware: Mapping[str, BoolArray], rng: np.random.Generator
 ) -> Figures:
-    """Return the share of hops with the vehicle in view that are aware, with its interval over approaches."""
+    """Return the share of aware hops with the vehicle in view, with its interval over approaches."""
     in_view = [one.after_sight() for one in approaches]
     hits = np.array([aware[one.name][seen].sum() for one, seen in zip(approaches, in_view, strict=True)])
     hops = np.array([seen.sum() for seen in in_view])
@@ -159,7 +159,7 @@ def _aware_of(
 
 
 def _aware(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float) -> dict[str, BoolArray]:
-    """Return by recording in which hops something is known to be there; thresholds of other folds."""
+    """Return the aware hops of each recording, with thresholds from the other folds."""
     sites = [str(one.about["site"]) for one in streams]
     folds = deal_folds([one.label for one in streams], sites, rng).tolist()
     found = {}

@@ -1,4 +1,4 @@
-"""What the paper states of the front-end, section IX, on real recordings of a corner."""
+"""The paper's figures of the front-end (section IX) on real recordings of street corners."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ from worldstate_lab.trials.trial import Trial
 
 from .recordings import CornerRecording, seven_microphones
 
-# By figure of `front_end_study`. MUSIC needs the raw channels, which no spectrum holds.
+# By figure of `front_end_study`. MUSIC is missing: it needs the raw channels, which spectra do not contain.
 PAPER: Mapping[str, float] = {
     "bearing_srp_deg": 3.4,
     "bearing_gated_deg": 2.4,
@@ -27,20 +27,20 @@ PAPER: Mapping[str, float] = {
     "prominence_in_silence": 1.18,
     "looming_auroc": 0.735,
     "looming_correlation": 0.07,
-    "doppler_usable": 1.0,  # Of 41
+    "doppler_usable": 1.0,  # Of 41 approaches
 }
 DRAWS, DELAY_DRAWS = 500, 200
-# On the given recordings a spectrum shows the azimuth at which the camera sees a vehicle 0.4 to 0.5 s later.
+# In these recordings a spectrum shows the azimuth at which the camera detects a vehicle 0.4 to 0.5 s later.
 DELAYS_HOPS = range(8)
 
 
 def front_end_figures(
     trials: Sequence[Trial], recordings: Sequence[CornerRecording], rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Return each figure with its interval over recordings, and the paper's.
+    """Return each figure with its interval over recordings, and the paper's value.
 
-    Trials are those of `hearing.heard` with a camera, whose boxes are the reference of the bearings; what is
-    judged is the acoustic bearing. The tone of a pass is looked for in the first channel of the sound.
+    The trials are those of `hearing.heard` with a camera, whose boxes are the reference for the acoustic
+    bearings. The tone of a pass is searched for in the first channel of the sound.
     """
     told = [_with_pass(*one) for one in zip(trials, recordings, strict=True)]
     study = front_end_study(told, rng, DRAWS)
@@ -55,7 +55,7 @@ def front_end_figures(
 
 
 def _with_reference_after(trials: Sequence[Trial], hops: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Return the errors of bearings against where boxes are so many hops later, by junction, too."""
+    """Return the bearing errors against the boxes of a number of hops later, also by junction."""
     later = [_delayed(one, hops) for one in trials]
     study = front_end_study(later, rng, DELAY_DRAWS)
     figures = {name: study.figures[name] for name in ("bearing_srp_deg", "bearing_gated_deg")}
@@ -70,7 +70,7 @@ def _delayed(trial: Trial, hops: int) -> Trial:
 
 
 def _with_pass(trial: Trial, recording: CornerRecording) -> Trial:
-    """Add when the vehicle passes, why its tone cannot be used if so, and that there is no MUSIC bearing."""
+    """Add the time of the pass, the reason if its tone cannot be used, and missing MUSIC bearings."""
     about = {**trial.hops.about, "pass_s": None, "doppler": "no vehicle"}
     if not trial.hazard_free:
         about |= {"pass_s": pass_time_s(trial.truth), "doppler": _doppler(recording)}
@@ -85,9 +85,10 @@ def _doppler(recording: CornerRecording) -> str:
 
 
 def hidden_sign(trials: Sequence[Trial], rng: np.random.Generator) -> dict[str, Any]:
-    """Return how often the sign of a bearing is that of most at its junction, and that of the vehicle's side.
+    """Return how often a bearing has the sign of the majority at its junction, and of the vehicle's side.
 
-    Of the hops of the last three seconds before T0; by junction the share of bearings to the left, too.
+    It uses the hops of the last three seconds before T0, and also returns the share of bearings to the left
+    by junction.
 
     Examples
     --------
@@ -126,6 +127,6 @@ def _pooled(approaches: Sequence[Trial], left: Sequence[BoolArray], site: str) -
 
 
 def _bound() -> dict[str, float]:
-    """Return the spread of the seven microphones across the street, and how far it widens any bearing."""
+    """Return the spread of the seven microphones across the street, and how much it widens bearings."""
     moments = [one.horizontal_moment_m2 for one in (seven_microphones(), ovad_array())]
     return {"moment_m2": moments[0], "times_as_wide": float(np.sqrt(moments[1] / moments[0]))}

@@ -1,7 +1,8 @@
-"""The product's chain on a recording of a corner, on either of two paths, as a trial that methods are given.
+"""The full chain on a recording of a street corner, as a trial on which methods are scored.
 
-On the path `seven` the spectra of seven microphones and one channel of sound stand in for the array of the
-model that ships; on the path `pair` the whole product runs on two channels, with a model made for them.
+There are two paths. On the path `seven`, spectra of seven microphones and one channel of sound replace the
+array of the shipped model. On the path `pair`, the full chain runs on two channels with a model made for
+them.
 """
 
 from collections.abc import Iterator
@@ -41,18 +42,19 @@ from .recordings import NANODET_BOXES, CornerRecording
 PathName = Literal["seven", "seven_on_time", "pair"]
 SPECTRA: tuple[PathName, ...] = ("seven", "seven_on_time")
 PAIR = Path("pair")
-# What the product publishes at every hop, by side where it has sides.
+# Published values of each hop, some by side.
 PRODUCT_COLUMNS = (
-    "compared_nats",  # shape (2,): What the alarm of a side is decided by
+    "compared_nats",  # shape (2,): Value that the alarm of a side compares with its threshold
     "risk",  # shape (2,)
-    "within",  # shape (2, 4): Chances of coming into view by horizon; NaN without a reading
+    "within",  # shape (2, 4): Chances of coming into view by horizon; NaN without a sequence posterior
     "hypotheses",  # shape (3,): Hidden, visible, none
     "advised",  # shape (2,)
-    "side_nats",  # shape (2,): Log ratio of a vehicle hidden on a side to none or one in view, of the window
-    "groups",  # shape (2, groups): Posterior of the sequence by itself; NaN without
-    "inputs",  # shape (13,): What the sequence is given of the hop
+    # shape (2,): Log ratio of a vehicle hidden on a side to none or one in view, from the window
+    "side_nats",
+    "groups",  # shape (2, groups): Posterior of the sequence alone; NaN without a sequence model
+    "inputs",  # shape (13,): Inputs of the sequence model at this hop
 )
-_LEAST_NATS = -20.0  # Where nothing is compared yet
+_LEAST_NATS = -20.0  # Used before a value is available
 
 
 _SETTINGS = ListenSettings(boxes=NANODET_BOXES)
@@ -61,24 +63,24 @@ _NO_READING = np.full((len(SIDES), len(GROUPS)), np.nan)
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """One way to run the product over recordings.
+    """One configuration in which the full chain runs over recordings.
 
     Parameters
     ----------
     path : {"seven", "seven_on_time", "pair"}
-        What hears; see `CornerRecording.spectra` for the two readings of the spectra.
+        Source of the sound; see `CornerRecording.spectra` for the two ways to read spectra.
     model : Model
-        Made for what hears; of spectra the one that ships.
+        Model made for this source; for spectra, the shipped model.
     array : MicrophoneArray
-        Of the model.
+        Array of the model.
     boxes : str or None
-        Folder of boxes beside the sound; None for no camera.
+        Folder of the boxes beside the sound; None for no camera.
     miss_rates : MissRates, optional
-        Of the detector; the library's defaults where not given.
+        Miss rates of the detector; by default those of the library.
     degradation : float
-        d of the camera, where it is known.
+        d of the camera, if known.
     settings : ListenSettings
-        How it listens.
+        Settings of the listener.
     """
 
     path: PathName
@@ -114,7 +116,7 @@ class Chain:
 
 
 def corner_chain(path: PathName, folder: Path, model: Path | None, boxes: str | None) -> Chain:
-    """Return a path over recordings in a folder, by default with the pair's model or the one that ships."""
+    """Return a path over the recordings in a folder, by default with the pair's model or the shipped one."""
     if path in SPECTRA:
         return ovad_chain(read_model(model), boxes, path)
     pair = folder / PAIR
@@ -127,10 +129,10 @@ def ovad_chain(model: Model, boxes: str | None = "boxes", path: PathName = "seve
 
 
 def heard(chain: Chain, recording: CornerRecording) -> Trial:
-    """Return a recording as the product heard it.
+    """Return a recording processed by the full chain, as a trial.
 
-    Beside what every trial has, `chains["filtered"].tracks` are the product's and its hops hold
-    `PRODUCT_COLUMNS`.
+    In addition to the fields of every trial, `chains["filtered"].tracks` contains the tracks of the filter,
+    and its hops contain `PRODUCT_COLUMNS`.
     """
     source, steps = chain.source(recording), list(chain.steps(recording))
     vision = source.camera_channel()
@@ -170,7 +172,7 @@ def _product_row(step: Step) -> tuple[FloatArray, ...]:
     sides, reading = measured.signature.sides, measured.sequence
     history = step.checkpoint.history
     priors = cues[0].hypotheses
-    assert priors is not None  # A model listens here
+    assert priors is not None  # The source has a model here
     return (
         np.array([_LEAST_NATS if one.evidence is None else one.evidence.compared_nats for one in cues]),
         np.array([one.risk for one in cues]),
@@ -189,7 +191,7 @@ def cue_of(state: WorldState, side: str) -> RiskCue:
 
 
 def chances(cue: RiskCue) -> list[float]:
-    """Return the chances of coming into view by horizon, NaN where nothing is stated."""
+    """Return the chances of coming into view by horizon, NaN if the cue has none."""
     if cue.within is None:
         return [np.nan] * len(HORIZONS_S)
     return [cue.within[f"{horizon:g}"] for horizon in HORIZONS_S]

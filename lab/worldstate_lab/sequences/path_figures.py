@@ -1,4 +1,4 @@
-"""Every figure of one path over the recordings of a corner, with the camera and by sound alone."""
+"""Every figure of one path over the recordings of street corners, with the camera and with sound alone."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,21 +30,21 @@ from .recordings import NANODET_BOXES, CornerRecording
 from .scores import Row, alarm_row, at_false_recordings, at_onsets, calibration, leads, with_interval
 from .tracking import Tracked, tracked
 
-SEEDS = 5  # As many as those of `table --full`
+SEEDS = 5  # The same number as in `table --full`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heard:
-    """Recordings as one path heard them, in the same order."""
+    """Recordings processed on one path; all sequences have the same order."""
 
     recordings: Sequence[CornerRecording]
-    seen: Sequence[Trial]  # With the camera, where there is one
-    alone: Sequence[Trial]  # By sound alone
-    followed: Sequence[Tracked | None]  # Without a camera no vehicle in view is known
+    seen: Sequence[Trial]  # With the camera, if there is one
+    alone: Sequence[Trial]  # With sound alone
+    followed: Sequence[Tracked | None]  # None without a camera, since no vehicle in view is known then
 
 
 def heard_every_way(chain: Chain, recording: CornerRecording) -> tuple[Trial, Trial, Tracked | None]:
-    """Return a recording with the camera, by sound alone, and followed if there is a camera."""
+    """Return a recording processed with the camera and with sound alone, and its tracking, if filmed."""
     seen = _with_meter(heard(chain, recording), recording)
     if chain.boxes is None:
         return seen, seen, None
@@ -53,7 +53,7 @@ def heard_every_way(chain: Chain, recording: CornerRecording) -> tuple[Trial, Tr
 
 
 def _with_meter(trial: Trial, recording: CornerRecording) -> Trial:
-    """Add `meter_db`, how far channel 1 lies above its quiet level so far, and where leads count from."""
+    """Add `meter_db`, the level of channel 1 above its quiet level so far, and the time for leads."""
     sound, rate_hz = recording.samples()
     hops = int(len(sound) / rate_hz * HOP_RATE_HZ)
     pressure_pa = FULL_SCALE_PA * sound[: round(hops * rate_hz / HOP_RATE_HZ), 0].astype(np.float64)
@@ -65,13 +65,13 @@ def _with_meter(trial: Trial, recording: CornerRecording) -> Trial:
 
 @dataclass(frozen=True, slots=True)
 class LoudnessMeter:
-    """An alarm while the sound is so much louder than the place was."""
+    """Alarm rule: the sound level exceeds the earlier level of the place by a threshold."""
 
     name: str = "loudness meter .02"
     alpha: float = 0.02
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
-        """Set the decibels on hazard-free calibration recordings."""
+        """Set the threshold in decibels on hazard-free calibration recordings."""
         calm = [one.hops.meter_db for one in calibration if one.hazard_free]
         least_db = neyman_pearson_threshold(calm, self.alpha)
 
@@ -92,7 +92,7 @@ _OWN: tuple[Method, ...] = (
 _SIGHT: tuple[Method, ...] = (
     VisionOnly(),
     RadarFieldOfView(),
-    # By the filter of OVAD's authors hardly a box of NanoDet would count.
+    # The filter of OVAD's authors would reject nearly every box of NanoDet.
     *(OcSortRecovery(reading, keep=NANODET_BOXES) for reading in ("stock", "coasting")),
 )
 _TABLE = tuple(
@@ -103,14 +103,14 @@ _TABLE = tuple(
 
 
 def classifiers_of(features: Path, lists: Sequence[Path]) -> Classifiers:
-    """Return the published classifier, trained on released windows without those of listed recordings."""
-    # All recordings that are listed, at hand or not: those that are kept apart are to be tested as well.
+    """Return the published classifier, trained on released windows except those of the listed recordings."""
+    # All listed recordings, present or not: withheld recordings must remain usable for tests too.
     return Classifiers(read_features(features).without(frozenset().union(*map(read_ids, lists))))
 
 
 @dataclass(slots=True)
 class _Untrained(Classifiers):
-    """No published classifier: trials stay as they were heard."""
+    """No published classifier: trials are returned unchanged."""
 
     windows: None = field(default=None)
 
@@ -125,15 +125,15 @@ BySide = Callable[[Trial], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class HopScore:
-    """A score of every hop; of two sides the larger counts, and their difference names the side."""
+    """A score per hop. Of two sides the larger value is used, and their difference gives the side."""
 
     name: str
-    seen: bool  # Whether it is heard with the camera
+    seen: bool  # Whether it uses the trials with the camera
     of: BySide  # shape (n,) or (n, 2)
-    sides: BySide | None = None  # shape (n, 2): What names the side of a score without sides
+    sides: BySide | None = None  # shape (n, 2): Values that give the side if the score itself has no sides
 
     def trials(self, path: Heard) -> Sequence[Trial]:
-        """Return the trials that it is read from."""
+        """Return the trials from which the score is computed."""
         return path.seen if self.seen else path.alone
 
     def scores(self, path: Heard) -> list[FloatArray]:
@@ -142,12 +142,12 @@ class HopScore:
         return [one if one.ndim == 1 else one.max(axis=1) for one in found]
 
     def right(self, path: Heard) -> list[FloatArray] | None:
-        """Return by how much the right is likelier than the left, shape (n,) a trial; None without sides."""
+        """Return the score of right minus left, shape (n,) per trial; None without sides."""
         found = [(self.sides or self.of)(one) for one in self.trials(path)]
         return None if found[0].ndim == 1 else [one[:, 1] - one[:, 0] for one in found]
 
     def figures(self, path: Heard, rng: np.random.Generator) -> dict[str, Any]:
-        """Return what the score is worth."""
+        """Return the figures of the score."""
         return score_figures(self.trials(path), self.scores(path), self.right(path), rng)
 
 
@@ -157,7 +157,7 @@ def score_figures(
     right: Sequence[FloatArray] | None,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Return leads of a score (n,) a trial, and the curves of its thresholds."""
+    """Return the lead times of a score, shape (n,) per trial, and the curves over its thresholds."""
     return {
         "leads": leads(trials, scores, right, rng),
         "at_onsets": at_onsets(trials, scores, rng),
@@ -166,8 +166,8 @@ def score_figures(
 
 
 _MEAN_HOPS = 20  # Two seconds
-_LEAST_NATS = -20.0  # Where the window gives no sides
-_SMALLEST = 1e-9  # Of a chance whose log-odds are formed
+_LEAST_NATS = -20.0  # If the window gives no sides
+_SMALLEST = 1e-9  # Lower bound of a probability before its log-odds are computed
 
 
 def _window(trial: Trial) -> FloatArray:
@@ -175,7 +175,7 @@ def _window(trial: Trial) -> FloatArray:
 
 
 def _unseen(trial: Trial) -> FloatArray:
-    """Return P(hidden) where a camera has ruled out that the vehicle is in view."""
+    """Return P(hidden), given that a camera has ruled out a vehicle in view."""
     hidden, none = _window(trial), posteriors(trial, "shipped")[:, -1]
     return hidden / (hidden + none)
 
@@ -196,9 +196,10 @@ def _sequence(trial: Trial) -> FloatArray:
 
 
 def _decision(trial: Trial) -> FloatArray:
-    """Return the mean over 0.3 s of the log-odds of the stated chance to come into view within 3 s."""
-    # What is held against the threshold, `compared_nats`, is on another scale before the sequence is read,
-    # in the first second of every recording: in the curves those hops would count as early warnings.
+    """Return the mean over 0.3 s of the log-odds of the published chance to come into view within 3 s."""
+    # `compared_nats`, which the alarm compares with its threshold, has another scale in the first second of
+    # every recording, before the sequence model has input. In the curves those hops would count as early
+    # warnings.
     chance = np.clip(np.nan_to_num(trial.hops.within[..., HORIZONS_S.index(3.0)]), _SMALLEST, 1.0 - _SMALLEST)
     log_odds = np.log(chance) - np.log1p(-chance)
     recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
@@ -228,7 +229,7 @@ SCORES = (
 
 
 def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dict[str, Any]:
-    """Return every figure of a path; without classifiers no row of the published one is among them."""
+    """Return every figure of a path; without classifiers, rows of the published classifier are missing."""
     rng = np.random.default_rng(seed)
     methods = (*_OWN, *_SIGHT, *(_TABLE if classifiers else ()))
     run = run_protocol(STATIC, path.seen, methods, classifiers or _Untrained(), range(seed, seed + SEEDS))
@@ -251,7 +252,7 @@ def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dic
 
 
 def _rows(run: ProtocolRun, path: Heard, rng: np.random.Generator) -> dict[str, Row]:
-    """Return the row of every method, and of the alarm that ships by sound alone."""
+    """Return the row of every method, and of the shipped alarm with sound alone."""
     alone = [[one.chains["filtered"].alarm for one in path.alone]]
     rows = {"world-state advisory, sound alone": alarm_row(path.alone, alone, rng)}
     for name, passes in run.decisions.items():
@@ -260,7 +261,7 @@ def _rows(run: ProtocolRun, path: Heard, rng: np.random.Generator) -> dict[str, 
 
 
 def _window_figures(run: ProtocolRun, method: str, rng: np.random.Generator) -> dict[str, Row]:
-    """Return AUROC by horizon before T0, and ECE of the score as it is and of the risk of five folds."""
+    """Return AUROC by horizon before T0, and ECE of the raw score and of the risk over five folds."""
     score = Score.of(run.trials, run.decisions[method])
     draws = stratified_draws(score.draw_strata, rng)
     drawn = score.draws(np.vstack([np.arange(len(run.trials)), draws]))
@@ -273,7 +274,7 @@ def _merged(rows: Mapping[str, Row]) -> Row:
     return {key: value for row in rows.values() for key, value in row.items()}
 
 
-# By the name in a path's figures: where the simulated exam of a model has the same.
+# By name in a path's figures: the name of the same figure in the simulated exam of a model.
 _EXAM = {
     **{f"auroc_{lead}": f"auroc_{lead}s_before" for lead in ("1", "2", "3")},
     "warned": "detected",
@@ -285,6 +286,6 @@ _EXAM = {
 
 
 def exam_figures(path: Path) -> dict[str, float | None]:
-    """Return what the simulated exam of a model has of the figures of a path."""
+    """Return those figures of a path that the simulated exam of a model contains too."""
     exam: Any = read_json(path, "exam of a model")
     return {name: exam.get(other) for name, other in _EXAM.items()}

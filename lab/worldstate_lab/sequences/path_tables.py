@@ -1,4 +1,4 @@
-"""The figures of a path as tables for people, with those of its model's simulated exam beside them."""
+"""The figures of a path as printed tables, with those of its model's simulated exam beside them."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -27,9 +27,9 @@ def _tables(path: str, found: Mapping[str, Any]) -> Iterator[Table]:
     basis = f"{path}: {on['approaches']} approaches, {on['hazard_free']} hazard-free recordings"
     exam, heard = found.get("exam"), "with the camera" if found["camera"] else "sound alone"
     yield _leads(found["leads"], exam, f"{basis}, {on['hazard_free_hours']:.3f} h; risk, {heard}")
-    # The filter of OVAD's authors stands in the paper's rows of the camera.
-    counted = f"boxes from {NANODET_BOXES.min_score} and {NANODET_BOXES.min_height_px:g} px on"
-    untouched = f"alarms; thresholds of five folds, those of the product untouched; {counted}"
+    # The paper's rows with a camera use the filter of OVAD's authors instead.
+    counted = f"boxes from {NANODET_BOXES.min_score} and {NANODET_BOXES.min_height_px:g} px up"
+    untouched = f"alarms; thresholds from five folds, those of the product unchanged; {counted}"
     yield alarm_table(found["rows"], "alarm", untouched, exam)
     for name, key in (
         ("sound alone", "at_onsets"),
@@ -56,7 +56,7 @@ def _lead_row(name: str, row: Row, exam: Mapping[str, Any] | None) -> tuple[Cell
 def alarm_table(
     rows: Mapping[str, Row], head: str, title: str, exam: Mapping[str, Any] | None = None
 ) -> Table:
-    """Return a table of alarms, each in a row, and of what the simulated exam of a model has of them."""
+    """Return a table of alarms, one per row, with the figures of a model's simulated exam."""
     cells = [(name, *_alarm_row(row)) for name, row in rows.items()]
     if exam is not None:
         warned, lead, rate = (_value(exam[one]) for one in ("warned", "lead_s_missed_0", "alarms_per_hour"))
@@ -81,7 +81,7 @@ def _alarm_row(row: Row) -> tuple[Cell, ...]:
 
 
 def scores_table(scores: Mapping[str, Any], title: str) -> Table:
-    """Return a table of scores: AUROC before T0, and what their best thresholds warn of."""
+    """Return a table of scores: AUROC before T0, and the warnings at their best thresholds."""
     heads = (
         "score",
         *(f"{one} s" for one in _SHOWN_LEADS),
@@ -101,9 +101,9 @@ def _score_row(found: Mapping[str, Any]) -> tuple[Cell, ...]:
 
 
 def _sentences(found: Mapping[str, Any]) -> list[str]:
-    """Return windows, risk and calibration, each in a line, and the exam's figures."""
+    """Return lines on windows, risk and calibration, and on the figures of the exam."""
     lines = []
-    for name, some in (("model that ships", found), ("published classifier", found["published"])):
+    for name, some in (("shipped model", found), ("published classifier", found["published"])):
         if some is not None:
             parts = [f"{one} {_spread(some['horizons'], one).text}" for one in ("all", "2s", "1s")]
             parts += [f"{one} {_spread(some['risk'], one).text}" for one in ("ece_raw", "ece")]
@@ -125,7 +125,7 @@ def _sentences(found: Mapping[str, Any]) -> list[str]:
     if "exam" in found:
         parts = [f"{name} {_value(value, 3).text}" for name, value in found["exam"].items()]
         lines.append(f"simulated exam: {', '.join(parts)}")
-    return lines + [f"not heard: {name}: {why}" for name, why in found["failed"].items()]
+    return lines + [f"not processed: {name}: {why}" for name, why in found["failed"].items()]
 
 
 def _spread(row: Row, name: str) -> Value:

@@ -1,7 +1,7 @@
-"""Real recordings of a corner as they lie in a folder: truth, spectra, two channels of sound, boxes.
+"""Real recordings of street corners in a folder: truth, spectra, two channels of sound, boxes.
 
-The layout holds `truth.csv`, `srp.npz`, `sound/ID.flac`, `boxes/ID.json` and `video/ID.mp4`. The spectra are
-of every eighth microphone of OVAD's array, the sound is of two others.
+The folder contains `truth.csv`, `srp.npz`, `sound/ID.flac`, `boxes/ID.json` and `video/ID.mp4`. The spectra
+are of every eighth microphone of OVAD's array, and the sound is of two other microphones.
 """
 
 from dataclasses import dataclass, replace
@@ -22,25 +22,26 @@ from worldstate.ground.values import nanoseconds
 
 TRUTH, SPECTRA = "truth.csv", "srp.npz"
 _COLUMNS = ("id", "junction", "side", "t0_s", "seconds")
-# In the file azimuths count to the right.
+# In the file, azimuths are positive to the right.
 _AZIMUTHS_RAD = np.radians(np.linspace(-90.0, 90.0, 180))
 _MOST_BYTES = 64 << 20
-# A vehicle that stands has a box about its place in images far apart, a passing one only in a few in a row.
-# Boxes of a parked car flicker: in half of the images, and an overlap of 0.6, is too much to ask of them.
-# Share of hazard-free images with a moving box 0.005 instead of 0.022, of images after T0 the same 0.836.
+# A parked vehicle has a box at its place in images far apart, a passing one only in a few consecutive images.
+# Boxes of a parked car flicker, so an overlap of 0.6 in half of the images would reject too few. With these
+# limits the share of hazard-free images with a moving box is 0.005 (was 0.022); of images after T0 it remains
+# 0.836.
 _STANDS_IOU, _STANDS_IMAGES, _STANDS_SPAN = 0.5, 3, 0.4
-# Below what silence has.
+# Lower than the power of silence.
 LEAST_POWER = 1e-3
-# Chosen on the clean boxes of 45 recordings, each junction left out; `worldstate-lab staged` prints what was
-# tried. Share of the images after T0 with the vehicle found, and of hazard-free ones with a moving box: 0.83
-# and 0.004 here, 0.86 and 0.018 at 30 px, 0.08 and 0.00 with the library's defaults (0.75, 100 px). The
-# detector's own least score is 0.3. Without SA1, SB1 or SB3 the least height would be 30, 60 or 0 px.
+# Chosen on the clean boxes of 45 recordings, leaving out each junction; `worldstate-lab staged` prints all
+# candidates. Share of the images after T0 with the vehicle detected, and of hazard-free images with a moving
+# box: 0.83 and 0.004 here, 0.86 and 0.018 at 30 px, 0.08 and 0.00 with the library's defaults (0.75, 100 px).
+# The detector reports no score below 0.3. Without SA1, SB1 or SB3 the minimum height would be 30, 60 or 0 px.
 NANODET_BOXES = DetectionFilter(frozenset({"car", "motorcycle", "bus", "truck"}), 0.3, 60.0)
 
 
 @dataclass(frozen=True, slots=True)
 class CornerRecording:
-    """One recording of a corner.
+    """One recording of a street corner.
 
     Examples
     --------
@@ -52,42 +53,42 @@ class CornerRecording:
     folder: Path
     name: str
     junction: str
-    side: str  # That the approach comes from: left, right; none without a hazard
-    t0_s: float  # Line-of-sight entry; without a hazard only the time from which leads are counted
+    side: str  # Side of the approach: left or right; none if there is no hazard
+    t0_s: float  # Line-of-sight entry; without a hazard, only the time to which leads refer
     length_s: float
-    start_s: float = 0.0  # Cut off before; T0 and length count from there
+    start_s: float = 0.0  # Length cut off at the start; T0 and length are relative to it
 
     @property
     def hazard_free(self) -> bool:
-        """Whether nothing approaches."""
+        """Whether the recording contains no approach."""
         return self.side == "none"
 
     @property
     def sound(self) -> Path:
-        """The file of two channels, left and right."""
+        """The sound file with two channels, left and right."""
         return self.folder / "sound" / f"{self.name}.flac"
 
     @property
     def video(self) -> Path:
-        """The camera's images."""
+        """The video of the camera."""
         return self.folder / "video" / f"{self.name}.mp4"
 
     def cut(self, start_s: float) -> "CornerRecording":
-        """Return the recording without so much of its start, whole tenths of a second."""
+        """Return the recording without this much of its start, in whole tenths of a second."""
         t0_s, length_s = self.t0_s - start_s, self.length_s - start_s
         return replace(self, start_s=self.start_s + start_s, t0_s=t0_s, length_s=length_s)
 
     def samples(self) -> tuple[Float32Array, float]:
-        """Read both channels of the sound, shape (n, 2), and its rate, Hz."""
+        """Read both channels of the sound, shape (n, 2), and the sample rate in Hz."""
         with open_audio(self.sound) as audio:
             first = round(self.start_s * audio.sample_rate_hz)
             return audio.span(first, audio.frames - first), audio.sample_rate_hz
 
     def spectra(self, on_time: bool = False) -> GivenSpectra:
-        """Read the spectra of seven microphones, a row every 0.1 s as they lie in the file, or on time.
+        """Read the spectra of seven microphones, one row per 0.1 s, as stored or at their correct times.
 
-        A row is of the second that *begins* with it: see `half_windows`. Taken as they lie, a window of ten
-        rows reaches 0.9 s beyond its end.
+        A row covers the second that *begins* at its time: see `half_windows`. If rows are used unchanged, a
+        window of ten rows contains sound up to 0.9 s after its end.
         """
         path = self.folder / SPECTRA
         values = load_npz(path, "spectra by recording", _MOST_BYTES, lambda found: found.get(self.name))
@@ -100,13 +101,13 @@ class CornerRecording:
         return GivenSpectra(half_windows(rows)[first:], _AZIMUTHS_RAD, seven_microphones(), HALF_HOPS)
 
     def boxes(self, folder: str | Path = "boxes") -> DetectionLog:
-        """Read the boxes of every image, those of vehicles that stand through the recording left out."""
+        """Read the boxes of every image, except those of vehicles parked throughout the recording."""
         log = without_standing(read_boxes(self.folder / folder / f"{self.name}.json"))
         return log if not self.start_s else _from(log.shifted(-self.start_s))
 
 
 def seven_microphones() -> MicrophoneArray:
-    """Return the microphones that the spectra are of: every eighth of OVAD's.
+    """Return the microphones of the spectra: every eighth of OVAD's.
 
     Examples
     --------
@@ -117,15 +118,16 @@ def seven_microphones() -> MicrophoneArray:
 
 
 def half_windows(rows: FloatArray) -> FloatArray:
-    r"""Return the spectra of the half second that ends with each hop, from those of the second that begins.
+    r"""Return the spectra of the half second before each hop, from those of the second after it.
 
     .. math:: h_k = 2 r_k - h_{k+5}, \qquad r_k = \tfrac12 (h_k + h_{k+5})
 
-    from the end of the recording backwards, where the seconds are cut short. At T0 - 1 s and T0 - 0.5 s they
-    are the released features of 23 approaches: correlation 0.988, level within 0.001 [deviation 0.003] nats;
-    means of five rows as they lie have 0.985 and 0.007 [0.013].
+    from the end of the recording backwards, because the last seconds are cut short. At T0 - 1 s and T0 - 0.5
+    s the results equal the released features of 23 approaches: correlation 0.988, level within 0.001
+    [deviation 0.003] nats. Means of five unchanged rows have 0.985 and 0.007 [0.013].
 
-    Shapes: rows (n, azimuths), returns the same; the first four repeat the first whole one.
+    Shapes: rows (n, azimuths), the result has the same shape; its first four rows repeat the first complete
+    one.
 
     Examples
     --------
@@ -141,12 +143,12 @@ def half_windows(rows: FloatArray) -> FloatArray:
         whole = min(2 * half, count - k)
         begin[k] = (whole * rows[k] - (whole - half) * begin[k + half]) / half
     ending = np.concatenate([np.repeat(begin[:1], half - 1, axis=0), begin])[:count]
-    # Errors of the recursion may leave a direction without power.
+    # Rounding errors of the recursion may leave a direction without power.
     return np.asarray(np.clip(ending, LEAST_POWER, 1.0))
 
 
 def read_recordings(folder: Path) -> tuple[CornerRecording, ...]:
-    """Read the list of the recordings in a folder, in its order."""
+    """Read the list of recordings in a folder, in its order."""
     found = []
     for line, row in read_rows(folder / TRUTH, _COLUMNS):
         if row["side"] not in ("left", "none", "right"):
@@ -171,7 +173,7 @@ def read_boxes(path: Path) -> DetectionLog:
 
 
 def without_standing(log: DetectionLog) -> DetectionLog:
-    """Return a log without the boxes of what stands at one place for at least 0.4 of the recording.
+    """Return a log without boxes that stay at one place for at least 0.4 of the recording.
 
     Examples
     --------
@@ -196,7 +198,7 @@ def without_standing(log: DetectionLog) -> DetectionLog:
 
 
 def _from(log: DetectionLog) -> DetectionLog:
-    """Return the images of a log from its zero on."""
+    """Return the images of a log from time zero on."""
     first = int(np.searchsorted(log.stamps_ns, 0))
     return DetectionLog(log.frames[first:], log.stamps_ns[first:], log.source)
 

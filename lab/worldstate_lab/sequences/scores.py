@@ -1,10 +1,11 @@
-"""What a score of every hop, or an alarm, is worth on real recordings of a corner.
+"""Figures of a score per hop, or of an alarm, on real recordings of street corners.
 
-A recording is warned of at any alarm hop before T0; the lead is that of the first one, more than five seconds
-too. An onset is a rising edge, or an alarm at the first hop. A lasting alarm stands half a second before T0,
-and its lead is from its own onset. Thresholds that are swept afterwards give a curve, never a row of a table.
+A recording is warned if any hop before T0 is in alarm; its lead is that of the first such hop, even if it is
+more than five seconds. An onset is a rising edge, or an alarm at the first hop. A lasting alarm is on at 0.5
+s before T0, and its lead counts from its own onset. Thresholds that are swept on the test recordings give a
+curve and never a row of a table.
 
-Trials hold in `about` from what time leads count without a hazard, `leads_from_s`.
+In trials without a hazard, `about` contains `leads_from_s`, the time to which leads refer.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,19 +33,19 @@ from worldstate_lab.metrics.intervals import draw_weights, middle, pooled_draws,
 from worldstate_lab.trials.trial import Trial
 
 LEADS_S = (0.5, 1.0, 1.5, 2.0, 3.0)
-# So long before T0 nothing can be heard of the vehicle: what is found there is the ambience of its recording.
+# This long before T0 the vehicle is inaudible: a score above chance comes from the ambience of its recording.
 CONTROLS_S = (5.0, 6.0)
 ONSETS, FALSE_RECORDINGS = (0, 1, 3, 6), (0, 1, 2, 3)
 LASTS_S = 0.5  # Before T0
-PASSED_S = 2.0  # After T0; from then on an advisory is about what has gone
-WITHIN_S = 2.0  # Of the chance that is calibrated
+PASSED_S = 2.0  # After T0; later advisories concern a vehicle that has passed
+WITHIN_S = 2.0  # Horizon of the calibrated chance
 
 Row = dict[str, Any]
-Alarms = Sequence[BoolArray]  # One a trial, shape (n,)
+Alarms = Sequence[BoolArray]  # One per trial, shape (n,)
 
 
 def hop_before(trial: Trial, lead_s: float) -> IndexArray:
-    """Return the hop that ends so long before T0, or before what stands for it; none if there is none.
+    """Return the hop that ends this long before T0, or before its substitute; empty if there is none.
 
     Examples
     --------
@@ -59,7 +60,7 @@ def hop_before(trial: Trial, lead_s: float) -> IndexArray:
 
 
 def areas(parts: Sequence[FloatArray], positive: BoolArray, weights: FloatArray) -> FloatArray:
-    r"""Return the AUROC where recording r counts weights[d, r] times, NaN without a label, shape (D,).
+    r"""Return the AUROC with weight weights[d, r] for recording r, NaN if a label is missing, shape (D,).
 
     .. math:: w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)
 
@@ -76,7 +77,7 @@ def areas(parts: Sequence[FloatArray], positive: BoolArray, weights: FloatArray)
 
 
 def strata(trials: Sequence[Trial]) -> list[tuple[str, str]]:
-    """Return label and junction of each trial: what draws keep the numbers of."""
+    """Return label and junction of each trial, the strata of the draws."""
     return [(one.label, one.site) for one in trials]
 
 
@@ -86,10 +87,10 @@ def leads(
     sides: Sequence[FloatArray] | None,
     rng: np.random.Generator,
 ) -> dict[str, Row]:
-    """Return by lead how the hop of approaches compares with that of hazard-free recordings, and all hops.
+    """Compare the hop of approaches at each lead time with the same hop, and all hops, of hazard-free ones.
 
-    Shapes: scores and sides (n,) a trial; a side score is larger where the right is likelier. Intervals are
-    the middle 95 % over draws of recordings, within each label at each junction.
+    Shapes: scores and sides (n,) per trial; a side score is larger if the right is likelier. Intervals are
+    the central 95 % over draws of recordings within each label at each junction.
     """
     draws = draw_weights(stratified_draws(strata(trials), rng), len(trials))
     weights = np.vstack([np.ones(len(trials)), draws])
@@ -123,28 +124,28 @@ def _lead(
 
 
 def with_interval(name: str, values: FloatArray) -> Row:
-    """Return the first value and the middle of the draws behind it."""
+    """Return the first value with the central interval of the draws after it."""
     return {name: float(values[0]), f"{name}_interval": middle(values[1:])}
 
 
 def first_lead_s(trial: Trial, alarm: BoolArray) -> float:
-    """Return how long before T0 the first alarm hop is; 0 if none is."""
+    """Return the time from the first alarm hop to T0; 0 if there is no alarm."""
     lead_s = trial.t0_s - trial.hops.time_s
     return float(lead_s.max(initial=0.0, where=alarm & (lead_s > SLACK_S)))
 
 
 def lasting_lead_s(trial: Trial, alarm: BoolArray) -> float:
-    """Return how long before T0 the alarm began that stands `LASTS_S` before it; 0 if none stands."""
+    """Return the time to T0 from the onset of the alarm that is on at `LASTS_S` before T0; 0 if none is."""
     onsets, times_s = rising_edges(alarm), trial.hops.time_s
     began = [onsets[onsets <= hop][-1] for hop in hop_before(trial, LASTS_S) if alarm[hop]]
     return float(trial.t0_s - times_s[began[0]]) if began else 0.0
 
 
 def alarm_row(trials: Sequence[Trial], passes: Sequence[Alarms], rng: np.random.Generator) -> Row:
-    """Return what alarms warn of and what they cost, mean over passes such as seeds.
+    """Return detections and false alarms of an alarm, mean over passes such as seeds.
 
-    `advisory_share` is of hazard-free hops, `after_pass_share` of hops from `PASSED_S` to `AFTER_S` after T0,
-    `interval` is the exact one of alarms an hour.
+    `advisory_share` is the share of hazard-free hops in alarm, `after_pass_share` that of hops from
+    `PASSED_S` to `AFTER_S` after T0, and `interval` the exact interval of the onsets per hour.
 
     Examples
     --------
@@ -178,7 +179,7 @@ def _passed(trial: Trial) -> BoolArray:
 
 
 def _warned(first: FloatArray, lasting: FloatArray) -> Row:
-    """Return the part of a row that is about approaches; shapes (passes, approaches)."""
+    """Return the part of a row on approaches; shapes (passes, approaches)."""
     warned, stand = first > 0.0, lasting > 0.0
     count, n = float(warned.sum(axis=1).mean()), first.shape[1]
     return {
@@ -195,13 +196,13 @@ def _warned(first: FloatArray, lasting: FloatArray) -> Row:
 
 
 def _false_alarms(tables: Sequence[ApproachTable]) -> Row:
-    """Return the part of a row that is about hazard-free time, of a table a pass."""
+    """Return the part of a row on hazard-free time, from one table per pass."""
     onsets, hours = float(np.mean([one.onsets for one in tables])), tables[0].hours
     calm = [one for table in tables for one in table.hazard_free]
     return {
         "onsets": onsets,
         "alarms_per_hour": onsets / hours,
-        # Passes are about the same hours: their mean count is one count.
+        # All passes cover the same hours: their mean count is one count.
         "interval": poisson_interval(round(onsets), hours),
         "false_recordings": sum(bool(one.any()) for one in calm) / len(tables),
         "advisory_share": mean_of(np.concatenate(calm)),
@@ -211,9 +212,9 @@ def _false_alarms(tables: Sequence[ApproachTable]) -> Row:
 def at_onsets(
     trials: Sequence[Trial], scores: Sequence[FloatArray], rng: np.random.Generator
 ) -> dict[str, Row]:
-    """Return the row of the best threshold at no more than so many onsets, by their number: a curve.
+    """Return the row of the best threshold with at most this many onsets, by their number: a curve.
 
-    One threshold a row: that with the most warned; of equals that with the longest mean lead.
+    Each row has one threshold: that with the most warned recordings, and among equals the longest mean lead.
     """
     return _curve(trials, scores, "onsets", ONSETS, rng)
 
@@ -221,7 +222,7 @@ def at_onsets(
 def at_false_recordings(
     trials: Sequence[Trial], scores: Sequence[FloatArray], rng: np.random.Generator
 ) -> dict[str, Row]:
-    """Return the same at no more than so many hazard-free recordings in alarm."""
+    """Return the same rows with at most this many hazard-free recordings in alarm."""
     return _curve(trials, scores, "false_recordings", FALSE_RECORDINGS, rng)
 
 
@@ -252,7 +253,7 @@ def sweep(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> Mapping[str,
             found["false_recordings"] += alarm.any(axis=1)
         else:
             lead_s = np.maximum(trial.t0_s - trial.hops.time_s, 0.0)
-            # Whole milliseconds: thresholds with equal leads are equal, whatever the order of the sum.
+            # Rounded to milliseconds, so that equal leads give equal sums in any order of summation.
             first = np.where(alarm & (lead_s > SLACK_S), lead_s, 0.0).max(axis=1).round(3)
             found["warned"] += first > 0.0
             found["lead_s"] += first
@@ -260,9 +261,9 @@ def sweep(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> Mapping[str,
 
 
 def calibration(trials: Sequence[Trial], rng: np.random.Generator, *, within_s: float = WITHIN_S) -> Row:
-    """Return how true the chances are that something comes into view in time on a side, and their skill.
+    """Return calibration and skill of the chances that a vehicle comes into view in time on a side.
 
-    Of both sides, at hops before T0 of approaches and at all hops of hazard-free recordings.
+    Both sides are used, at hops before T0 of approaches and at all hops of hazard-free recordings.
     """
     parts = [_chances(one, within_s) for one in trials]
     if not sum(map(len, parts)):
@@ -278,13 +279,13 @@ def calibration(trials: Sequence[Trial], rng: np.random.Generator, *, within_s: 
 
 
 def _calibrated(pairs: AnyArray) -> dict[str, float | None]:
-    """Return the figures of stated chances and what came true, shape (n, 2)."""
+    """Return the calibration figures of pairs of predicted chance and outcome, shape (n, 2)."""
     said, true = pairs[:, 0], pairs[:, 1]
     return {"ece": expected_calibration_error(said, true), "brier_skill": brier_skill(said, true)}
 
 
 def _chances(trial: Trial, within_s: float) -> FloatArray:
-    """Return the chance of each side and whether it came true, shape (2 n, 2)."""
+    """Return the predicted chance and the outcome of each side, shape (2 n, 2)."""
     said = trial.hops.within[:, :, HORIZONS_S.index(within_s)]
     coming_s = (trial.t0_s - trial.hops.time_s)[:, None] + np.zeros(len(SIDES))
     own = np.array([side == trial.label for side in SIDES])

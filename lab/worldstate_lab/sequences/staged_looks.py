@@ -1,7 +1,8 @@
-"""What a detector finds of the vehicle after T0, clean and staged: which boxes count, miss rates, awareness.
+"""Detections of the vehicle after T0, clean and staged: accepted boxes, miss rates, awareness.
 
-The reference vehicle is the moving vehicle of the clean boxes, from T0 to the last image that holds it. Boxes
-that stand through a recording are left out, as are those that are parked by the memory of the product.
+The reference vehicle is the moving vehicle of the clean boxes, from T0 to the last image that contains it.
+Boxes of vehicles parked throughout a recording, and boxes that the library's own memory marks as parked, are
+left out.
 """
 
 from collections.abc import Iterable, Sequence
@@ -35,17 +36,17 @@ from worldstate_lab.report.table import Value
 from .recordings import NANODET_BOXES, CornerRecording
 from .staged_video import Staging
 
-# What is tried; the detector reports nothing below the first score.
+# Candidates; the detector reports no score below the first.
 LEAST_SCORES = (0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.75)
 LEAST_HEIGHTS_PX = (0.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0)
-# Half the time between two images: a staged image belongs to the clean one of its time.
+# Half the time between two images: a staged image is matched to the clean image of its time.
 _NEAR_NS = nanoseconds(0.05)
 _EVERY_BOX = DetectionFilter(NANODET_BOXES.labels, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class BoxChoice:
-    """Least score and height, and what they accept.
+    """Minimum score and height of a box, and the shares of images that they accept.
 
     Examples
     --------
@@ -56,31 +57,31 @@ class BoxChoice:
     min_score: float
     min_height_px: float
     found: float  # Share of the images after T0 with a moving vehicle
-    false: float  # Of the hazard-free ones
+    false: float  # Share of the hazard-free images with one
 
     @property
     def gain(self) -> float:
-        """What is maximised."""
+        """The difference that the choice maximises."""
         return self.found - self.false
 
 
 @dataclass(frozen=True, slots=True)
 class WatchedImages:
-    """Score and height of the moving vehicles, shape (n, 2), in each image of a recording that is scored."""
+    """Score and height of the moving vehicles, shape (n, 2), in each scored image of a recording."""
 
     junction: str
     hazard_free: bool
     images: tuple[FloatArray, ...]
 
     def seen(self, min_score: float, min_height_px: float) -> int:
-        """Return the number of images with a box that counts."""
+        """Return the number of images with an accepted box."""
         return sum(
             bool(((one[:, 0] >= min_score) & (one[:, 1] > min_height_px)).any()) for one in self.images
         )
 
 
 def watched_images(recording: CornerRecording) -> WatchedImages:
-    """Return what the clean boxes of a recording hold that moves."""
+    """Return the moving vehicles in the clean boxes of a recording."""
     log = recording.boxes()
     moving = [_scores_and_heights(log, at) for at in range(len(log))]
     seen = np.array([bool(len(one)) for one in moving])
@@ -96,7 +97,7 @@ def _scores_and_heights(log: DetectionLog, at: int) -> FloatArray:
 
 
 def _scored(recording: CornerRecording, log: DetectionLog, seen: BoolArray) -> BoolArray:
-    """Return the images from T0 to the last with the vehicle; without a hazard those with a memory before."""
+    """Return which images are scored: from T0 to the last with the vehicle, or those with enough history."""
     if recording.hazard_free:
         return np.asarray(log.stamps_ns >= nanoseconds(PARKED_S))
     after = log.stamps_ns >= nanoseconds(recording.t0_s)
@@ -105,7 +106,7 @@ def _scored(recording: CornerRecording, log: DetectionLog, seen: BoolArray) -> B
 
 
 def box_choices(watched: Sequence[WatchedImages]) -> tuple[BoxChoice, ...]:
-    """Return what every least score and height accepts, the largest gain first.
+    """Return the accepted shares of every minimum score and height, the largest gain first.
 
     Examples
     --------
@@ -133,7 +134,7 @@ def _share(counts: Iterable[tuple[int, int]]) -> float:
 
 
 def left_out_choices(watched: Sequence[WatchedImages]) -> dict[str, BoxChoice]:
-    """Return the best choice without each junction, with what it accepts at that junction."""
+    """Return the best choice without each junction, with its shares at that junction."""
     found = {}
     for junction in sorted({one.junction for one in watched}):
         best = box_choices([one for one in watched if one.junction != junction])[0]
@@ -143,29 +144,29 @@ def left_out_choices(watched: Sequence[WatchedImages]) -> dict[str, BoxChoice]:
 
 
 def kept_boxes(detector: str) -> DetectionFilter:
-    """Return which boxes of a detector count."""
+    """Return the filter for the boxes of a detector."""
     return any_motion() if detector == "motion" else NANODET_BOXES
 
 
 def moving_in(log: DetectionLog, keep: DetectionFilter) -> BoolArray:
-    """Return which images hold a moving vehicle, shape (n,)."""
+    """Return which images contain a moving vehicle, shape (n,)."""
     return np.array([not kept_and_parked(log, at, keep)[1].all() for at in range(len(log))], bool)
 
 
 @dataclass(frozen=True, slots=True)
 class VisionRow:
-    """What a camera alone finds in one state."""
+    """Detections of a camera alone in one state."""
 
     state: str
-    looks: int  # Images after T0 that were searched
-    aware: Value  # Share of them with a moving vehicle
-    hazard_free: dict[str, float]  # The same of hazard-free images, by junction
+    looks: int  # Number of searched images after T0
+    aware: Value  # Share of these images with a moving vehicle
+    hazard_free: dict[str, float]  # The same share of hazard-free images, by junction
 
 
 def vision_row(
     staging: Staging, state: Condition, recordings: Sequence[CornerRecording], draws: IndexArray
 ) -> VisionRow:
-    """Return how aware the staged boxes are; `draws` (draws, approaches) says which make each draw."""
+    """Return the awareness from staged boxes; `draws` (draws, approaches) lists each draw's approaches."""
     counted = [_looks(staging, state, one) for one in recordings]
     hits, looks = np.array(
         [two for two, one in zip(counted, recordings, strict=True) if not one.hazard_free], np.float64
@@ -179,20 +180,20 @@ def vision_row(
 
 
 def _looks(staging: Staging, state: Condition, recording: CornerRecording) -> tuple[int, int]:
-    """Return in how many scored images something moves, and how many were searched."""
+    """Return the number of scored images with a moving vehicle, and of searched images."""
     staged = _boxes_in(staging.folder(state), recording)
     asked = np.array([at is not None for at in _clean_images(recording, staged)], bool)
     return int((moving_in(staged, kept_boxes(staging.detector)) & asked).sum()), int(asked.sum())
 
 
 def _clean_images(recording: CornerRecording, staged: DetectionLog) -> list[int | None]:
-    """Return the number of the clean image of each staged one, None where it is not scored."""
+    """Return the number of the clean image of each staged image, None if it is not scored."""
     clean, scored = _clean_boxes(recording)
     numbers = (clean.latest(stamp_ns, _NEAR_NS) for stamp_ns in staged.stamps_ns.tolist())
     return [at if at is not None and scored[at] else None for at in numbers]
 
 
-# What stands is looked for in every image, 0.2 s a file, and vision and beta both ask.
+# Parked vehicles are searched for in every image (0.2 s per file), and both vision and beta need the result.
 @lru_cache(maxsize=1024)
 def _boxes_in(folder: Path, recording: CornerRecording) -> DetectionLog:
     return recording.boxes(folder.absolute())
@@ -211,7 +212,7 @@ def staged_beta(staging: Staging, approaches: Sequence[CornerRecording], draws: 
 
 
 def staged_miss_rates(staging: Staging, approaches: Sequence[CornerRecording]) -> MissRates:
-    """Return the same counts as the library reads them: the miss rates of this detector."""
+    """Return the same counts in the library's format: the miss rates of this detector."""
     counted = [_beta_counts(staging, one) for one in approaches]
     families: dict[str, FamilyCounts] = {
         name: reduce(add, (one[name] for one in counted)) for name in FAMILIES
@@ -224,7 +225,7 @@ def _beta_counts(staging: Staging, recording: CornerRecording) -> dict[str, Fami
     tally = AbsenceTally(PinholeCamera.ovad(), AbsenceSettings(FAMILIES, NANODET_BOXES))
     clean, _ = _clean_boxes(recording)
     for family, level in product(FAMILIES, range(len(LEVELS))):
-        # The clean camera belongs to every family and is counted once.
+        # The clean camera belongs to every family but is counted once.
         if level or family == FAMILIES[0]:
             staged = _boxes_in(staging.folder(at_level(family, level)), recording)
             for at, found in zip(_clean_images(recording, staged), staged.frames, strict=True):
@@ -234,7 +235,7 @@ def _beta_counts(staging: Staging, recording: CornerRecording) -> dict[str, Fami
 
 
 def counted(frame: DetectionFrame, keep: DetectionFilter) -> DetectionFrame:
-    """Return the boxes of an image that count."""
+    """Return the accepted boxes of an image."""
     kept = frame.select(keep)
     labels = tuple(frame.labels[at] for at in kept.tolist())
     return DetectionFrame(frame.boxes_px[kept], frame.scores[kept], labels)

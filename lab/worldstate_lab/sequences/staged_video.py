@@ -1,7 +1,7 @@
-"""Boxes of a detector on staged videos: each recording decoded once, every state of the camera searched.
+"""Boxes of a detector on staged videos: each recording is decoded once and searched in every camera state.
 
-The files have the layout of `boxes/ID.json`, `OUT/DETECTOR-FAMILY-LEVEL/ID.json`, and are the cache: what
-exists is not searched again. An image that was not searched is null, one that was searched in vain is empty.
+The files `OUT/DETECTOR-FAMILY-LEVEL/ID.json` have the format of `boxes/ID.json` and serve as the cache:
+existing files are not computed again. An image is null if it was not searched and empty if nothing was found.
 """
 
 import importlib.util
@@ -26,19 +26,20 @@ from worldstate_lab.degradation.conditions import Condition, camera_conditions, 
 
 from .recordings import CornerRecording
 
-# Half of the camera's 1936: crops of 832 pixels are then the 416 of the network, and staging costs a quarter.
+# Half of the camera's 1936 pixels: crops of 832 pixels become the network's 416, and staging takes a quarter
+# of the time.
 WIDTH_PX, REDUCED = 968, 2.0
-# The crops begin in an odd row: without its first and last row an image is reduced along their edges.
+# The crops begin in an odd row: without its first and last row, an image is halved along their edges.
 _LEFT_OUT_ROWS = 1
 MODEL = Path("detector", "nanodet_m.onnx")
-# Of a search every second image halves an hour of inference; a motion detector has to see every image.
+# Searching every second image halves an hour of inference; a motion detector needs every image.
 EVERY = {"nanodet": 2, "motion": 1}
 _EXAMPLE = Path(__file__).resolve().parents[3] / "docs" / "examples" / "nanodet.py"
 
 
 @dataclass(frozen=True, slots=True)
 class Staging:
-    """What is searched by which detector, and where its boxes go.
+    """A detector, the recordings that it searches, and the folder of its boxes.
 
     Examples
     --------
@@ -49,7 +50,7 @@ class Staging:
 
     out: Path
     detector: str
-    make: Callable[[], Detector]  # A new one for every recording and state
+    make: Callable[[], Detector]  # Returns a new detector for every recording and state
     every: int = 1
     states: tuple[Condition, ...] = camera_conditions()
     seed: int = 0
@@ -63,22 +64,22 @@ class Staging:
         return self.folder(state) / f"{name}.json"
 
     def missing(self, recording: CornerRecording) -> tuple[Condition, ...]:
-        """Return the states that a recording was not searched in."""
+        """Return the states in which a recording was not searched yet."""
         return tuple(one for one in self.states if not self.path(one, recording.name).exists())
 
 
 def staging_of(detector: str, folder: Path, out: Path, seed: int = 0) -> Staging:
-    """Return how a named detector searches the recordings of a folder."""
+    """Return the staging of a named detector on the recordings of a folder."""
     make: Callable[[], Detector] = MotionDetector
     if detector == "nanodet":
         make = partial(opened_nanodet, folder / MODEL)
-        make()  # What is wrong with a model is stated before the work begins
+        make()  # Reports errors of the model before the work begins
     return Staging(out, detector, make, EVERY[detector], seed=seed)
 
 
 @cache
 def opened_nanodet(model: Path) -> Detector:
-    """Open NanoDet for reduced images, once a process: it has no state."""
+    """Open NanoDet for reduced images, once per process: it has no state."""
     example = nanodet_example()
     crops = [
         (left / REDUCED, (top - _LEFT_OUT_ROWS) / REDUCED, side / REDUCED)
@@ -90,17 +91,17 @@ def opened_nanodet(model: Path) -> Detector:
 
 @cache
 def nanodet_example() -> ModuleType:
-    """Import the decoder, which is a plug-in among the examples and no part of a package."""
+    """Import the decoder, a plug-in among the examples that belongs to no package."""
     spec = importlib.util.spec_from_file_location("nanodet", _EXAMPLE)
     if spec is None or spec.loader is None or not _EXAMPLE.is_file():
-        raise InputFileError(_EXAMPLE, "expected the example of a detector; it comes with the repository")
+        raise InputFileError(_EXAMPLE, "expected the example of a detector; it is part of the repository")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 def stage_recording(staging: Staging, recording: CornerRecording) -> int:
-    """Search a recording in the states that are missing; return the number of searches."""
+    """Search a recording in the missing states; return the number of searches."""
     states = staging.missing(recording)
     if not states:
         return 0
@@ -128,12 +129,12 @@ def _small(image: ImageArray) -> ImageArray:
 
 
 def _generator(seed: int, name: str, state: Condition, image: int) -> np.random.Generator:
-    """Return the generator of one image, so that what is staged depends on no other and on no detector."""
+    """Return the generator of one image: the staging depends on no other image and on no detector."""
     return np.random.default_rng([seed, zlib.crc32(f"{name} {state.name}".encode()), image])
 
 
 def _boxes(found: DetectionFrame, reduced: float) -> list[list[Any]]:
-    """Return boxes in pixels of the camera, as the layout has them."""
+    """Return boxes in pixels of the camera, in the format of the files."""
     boxes = found.boxes_px * reduced + [0.0, _LEFT_OUT_ROWS] * 2
     edges = np.round(boxes, 1).tolist()
     scores = np.round(found.scores, 3).tolist()
@@ -146,7 +147,7 @@ def _write(path: Path, frames: Sequence[Any], size: tuple[int, int], rate_hz: fl
 
 
 def milliseconds_a_search(staging: Staging, recording: CornerRecording) -> float:
-    """Return what one clean search takes, the second of two: the first one sets the detector up."""
+    """Return the duration of one clean search, the second of two: the first one initialises the detector."""
     small = _small(next(open_video(recording.video).frames()))
     detector = staging.make()
     detector.detect(small)

@@ -1,10 +1,10 @@
-"""A row that is not the product: log-odds of sequence, window and sound levels, added.
+"""Sum of the log-odds of sequence, window and sound levels: a comparison that is not shipped.
 
-The row is the sum of the log-odds of the sequence that ships, the larger side ratio of the window, and a
-logistic regression over the inputs of a sequence that are not window evidence. The regression is learned on
-simulated streams of two microphones, with the label "a vehicle comes into view within 3 s on this side";
-nothing real is learned. The spectra of seven microphones come without their sound, so the levels are those of
-the path of two microphones on the same recording.
+The sum has three terms: the log-odds of the shipped sequence model, the larger side ratio of the window, and
+a logistic regression over the sequence inputs that are not window evidence. The regression is trained on
+simulated streams of two microphones, with the label "a vehicle comes into view within 3 s on this side"; no
+real data are used. The spectra of seven microphones have no sound, so the levels come from the path of two
+microphones on the same recording.
 """
 
 import re
@@ -29,15 +29,15 @@ from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate_lab.trials.trial import Trial
 
-# The inputs that are no evidence of the window: level, loudness, bands, prominence, approach and bearing.
+# Inputs that are not window evidence: level, loudness, bands, prominence, approach and bearing.
 OTHERS = tuple(name for name in INPUTS if not re.search("this|other|lean|visible", name))
 _OTHER_INPUTS = [INPUTS.index(name) for name in OTHERS]
-# What a microphone measures and spectra do not hold.
+# Columns that are measured by a microphone and not contained in spectra.
 _LEVELS = [i for i, name in enumerate(COLUMNS) if name == "loudness" or name.startswith("band_")]
 COMING_S = 3.0
-# From 0.0002 to 2 the AUROC of the sum one second before T0 moves by 0.01.
+# Between 0.0002 and 2 the AUROC of the sum one second before T0 changes by 0.01.
 STRENGTH = 0.02
-_LEAST = 1e-9  # Of a probability whose log-odds are formed
+_LEAST = 1e-9  # Lower bound of a probability before its log-odds are computed
 
 Scores = dict[str, list[FloatArray]]
 
@@ -54,12 +54,12 @@ class LevelReading:
 
     slopes: FloatArray  # shape (35,)
     bias: float
-    usual: float  # Log-odds of the mean of what it was learned from
+    usual: float  # Log-odds of the mean label of the training data
 
     @classmethod
     def learned(cls, streams: Sequence[HeardStream], model: Model) -> "LevelReading":
-        """Learn from every third hop of streams, weighted as in the training of a sequence."""
-        # Window evidence is formed and left out again, so the window model changes nothing that is learned.
+        """Train on every third hop of streams, weighted as in the training of a sequence model."""
+        # Window evidence is computed and then left out, so the window model does not affect the training.
         rows = [_others(stream_evidence(parts_of(model)[0], one))[::EVERY_HOPS] for one in streams]
         truths = [stream_truth(one).coming_s[::EVERY_HOPS] <= COMING_S for one in streams]
         weights = np.repeat(stream_weights(streams), [one.size for one in truths])
@@ -70,18 +70,18 @@ class LevelReading:
         return cls(slopes[0], float(bias[0]), float(usual))
 
     def log_odds(self, columns: FloatArray) -> FloatArray:
-        """Return those of both sides, (n, 13) -> (n, 2); of a hop without columns the usual ones."""
+        """Return the log-odds of both sides, (n, 13) -> (n, 2); hops without columns have the usual value."""
         return _known(columns, lambda known: _others(known) @ self.slopes + self.bias, self.usual)
 
 
 def summed_scores(
     seven: Sequence[Trial], pair: Sequence[Trial], reading: LevelReading, model: Model
 ) -> Scores:
-    """Return the sums and their parts at every hop of recordings, each shape (n,), by the name of a row.
+    """Return the sums and their parts at every hop of recordings, each shape (n,), by row name.
 
     `seven` and `pair` are the same recordings on both paths of `hearing.heard`, `model` is that of the path
-    `seven`, `reading` was learned on simulated streams of the pair. Of the two sides the larger value counts.
-    Values are means over 0.3 s, except for rows "one hop" and the decision value that the product publishes.
+    `seven`, and `reading` was trained on simulated streams of the pair. Of the two sides the larger value is
+    used. Values are means over 0.3 s, except for rows "one hop" and the published decision value.
     """
     _, sequence = parts_of(model)
     parts = [_parts(*one, reading, sequence) for one in zip(seven, pair, strict=True)]
@@ -96,7 +96,7 @@ def _parts(
     mixed[:, _LEVELS] = beside[:, _LEVELS]
     one, both = (_coming(each, sequence).max(axis=1) for each in (columns, mixed))
     levels, window = reading.log_odds(beside).max(axis=1), _window_nats(seven)
-    # A window that the guard refused is evidence for no side.
+    # A window that the guard rejected is evidence for no side.
     ratio = np.nan_to_num(seven.hops.side_nats).max(axis=1)
     published = seven.hops.compared_nats.max(axis=1)
     smoothed = {
@@ -125,7 +125,7 @@ def _others(columns: FloatArray) -> FloatArray:
 
 
 def _coming(columns: FloatArray, sequence: SequenceModel) -> FloatArray:
-    """Return the log-odds of coming into view within 3 s by the sequence alone, shape (n, 2)."""
+    """Return the log-odds of coming into view within 3 s from the sequence alone, shape (n, 2)."""
     usual = SequencePosterior(sequence.share[None, None], 0.0)
     return _known(columns, lambda known: _log_odds(sequence.posterior(known)), float(_log_odds(usual)[0, 0]))
 
@@ -136,8 +136,8 @@ def _log_odds(posterior: SequencePosterior) -> FloatArray:
 
 
 def _known(columns: FloatArray, read: Callable[[FloatArray], FloatArray], usual: float) -> FloatArray:
-    """Return what is read of the hops that have columns, the usual value at the others, shape (n, 2)."""
-    # The guard may refuse the first hops of a recording: the history is empty until it accepts one.
+    """Return the values of the hops that have columns and the usual value at the others, shape (n, 2)."""
+    # The guard may reject the first hops of a recording: the history is empty until it accepts one.
     found, known = np.full((len(columns), len(SIDES)), usual), np.isfinite(columns).all(axis=1)
     if known.any():
         found[known] = read(columns[known])
@@ -145,14 +145,14 @@ def _known(columns: FloatArray, read: Callable[[FloatArray], FloatArray], usual:
 
 
 def _at_hops_of(trial: Trial, other: Trial) -> FloatArray:
-    """Return the columns of another path at the hops of a trial; behind its end those of its last hop."""
-    # There are 99 spectra of 100 images: the path of two microphones has a hop more.
+    """Return the columns of another path at the hops of a trial; after its end, those of its last hop."""
+    # There are 99 spectra for 100 images: the path of two microphones has one hop more.
     at = np.round((trial.hops.time_s - other.hops.time_s[0]) / HOP_S).astype(np.intp)
     return np.asarray(other.hops.inputs[np.clip(at, 0, len(other.hops) - 1)])
 
 
 def _window_nats(trial: Trial) -> FloatArray:
-    """Return the log-odds of a hidden vehicle against none by the window, shape (n,)."""
+    """Return the log-odds of a hidden vehicle against none from the window, shape (n,)."""
     left, right, _, none = (trial.hops.shipped + np.log(trial.hops.about["prior"]["shipped"])).T
     return np.asarray(np.logaddexp(left, right) - none)
 

@@ -1,7 +1,7 @@
-"""A vehicle followed from behind a real corner into view: identity, hand-over, bearings, tracks.
+"""Tracking of a vehicle from behind a real corner into view: identity, hand-over, bearings, tracks.
 
-The vehicle of an approach is the first box that appears on its side at T0, and the boxes of later images that
-continue it. The entity that is nearest to a box and in view stands for it, within 15 degrees.
+The vehicle of an approach is the first box that appears on its side at T0, with the boxes of later images
+that continue it. The entity in view that is nearest to a box is matched to it if it is within 15 degrees.
 """
 
 import math
@@ -33,14 +33,14 @@ from worldstate_lab.trials.listening import LIKELY, box_table, frame_row, refere
 from .hearing import Chain
 from .recordings import CornerRecording
 
-# Boxes jump by up to 14 degrees where a vehicle leaves one crop of the detector for the next: with the 8
+# Boxes jump by up to 14 degrees when a vehicle leaves one crop of the detector for the next. With the 8
 # degrees of pass labels, half of the vehicles have 11 boxes or fewer, with 15 they have 17.
 NEAR_RAD = math.radians(15.0)
-EARLY_S = 0.3  # T0 agrees with the images within it
-HIDDEN_S, STATED_S = 1.0, 3.0  # Before T0: an entity counts as hidden, a time to visible is compared
+EARLY_S = 0.3  # T0 agrees with the images to within this time
+HIDDEN_S, STATED_S = 1.0, 3.0  # Before T0, for hidden entities and for times to visible
 LATE = 0.9  # Quantile of the delays of a hand-over
-# Images so much later than a bearing: where the error is least at another one than 0, the sound of the
-# bearings and the images are not of one time.
+# Delays of the images after a bearing. If the error is smallest at a delay other than 0, the sound and the
+# images are not synchronous.
 SHIFTS_S = tuple(round(0.1 * i, 1) for i in range(-2, 9))
 _NOW = SHIFTS_S.index(0.0)
 WORLD, OC_SORT, PARTS = "world-state", "OC-SORT", ("localised", "missed", "false")
@@ -51,19 +51,20 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """What became of the vehicle of one approach."""
+    """Result of tracking the vehicle of one approach."""
 
     recording: CornerRecording
     identity: str  # Of the entity in view: kept, another, none hidden; no box
-    delay_s: float  # From the first box to a visible entity, infinite where there is never one; NaN: no box
-    side: str | None  # Of the first entity that stands for it
-    cues: HopTable  # Of the last seconds before T0
-    bearings: HopTable  # Acoustic ones of hops with a moving box; no camera enters them
-    costs: Mapping[str, FloatArray]  # By method; shape (images, 4): boxes, then degrees of parts of GOSPA
+    delay_s: float  # From the first box to a visible entity, infinite if there is none; NaN: no box
+    side: str | None  # Of the first entity matched to the vehicle
+    cues: HopTable  # In the last seconds before T0
+    bearings: HopTable  # Acoustic bearings of hops with a moving box, computed without the camera
+    # By method; shape (images, 4): number of boxes, then the parts of GOSPA in degrees
+    costs: Mapping[str, FloatArray]
 
 
 def tracked(chain: Chain, recording: CornerRecording) -> Tracked | None:
-    """Follow an approach with the camera, and again with every second image; None without a hazard.
+    """Track an approach with the camera, and again with every second image; None without a hazard.
 
     Examples
     --------
@@ -94,7 +95,7 @@ def tracked(chain: Chain, recording: CornerRecording) -> Tracked | None:
 
 
 def _number(time_s: float) -> int:
-    """Return a time in tenths of a second, which counts images and hops."""
+    """Return a time in tenths of a second, which numbers images and hops."""
     return round(time_s / HOP_S)
 
 
@@ -103,7 +104,7 @@ def _by_image(chain: Chain, recording: CornerRecording) -> dict[int, Step]:
 
 
 def _vehicle(boxes: HopTable, recording: CornerRecording) -> list[AzimuthBox]:
-    """Return the boxes of the vehicle that comes into view, at most one an image; none where none does."""
+    """Return the boxes of the vehicle that comes into view, at most one per image; empty if none does."""
     images: dict[float, list[AzimuthBox]] = {}
     for i in np.flatnonzero(boxes.moving):
         at_s, azimuth = float(boxes.time_s[i]), float(boxes.azimuth_rad[i])
@@ -127,7 +128,7 @@ def _standing_for(state: WorldState, box: AzimuthBox) -> Entity | None:
 
 
 def _identity(steps: Mapping[int, Step], found: Sequence[Entity | None], recording: CornerRecording) -> str:
-    """Return whether the entity of most images was hidden on the vehicle's side just before T0."""
+    """Return whether the entity matched in most images was hidden on the vehicle's side just before T0."""
     if not found:
         return "no box"
     last = (steps.get(n) for n in range(_number(recording.t0_s - HIDDEN_S), _number(recording.t0_s)))
@@ -138,7 +139,7 @@ def _identity(steps: Mapping[int, Step], found: Sequence[Entity | None], recordi
 
 
 def _cue_rows(steps: Iterable[Step], recording: CornerRecording) -> Iterator[tuple[float, ...]]:
-    """Yield what is stated of both sides in the seconds before T0."""
+    """Yield the published values of both sides in the seconds before T0."""
     for step in steps:
         before_s = recording.t0_s - seconds(step.state.stamp_ns)
         if SLACK_S < before_s <= STATED_S + SLACK_S:
@@ -150,7 +151,7 @@ def _cue_rows(steps: Iterable[Step], recording: CornerRecording) -> Iterator[tup
 
 
 def _bearings(steps: Iterable[Step], vision: VisionQuery, t0_s: float) -> HopTable:
-    """Return the bearings after T0, with their errors against images of a little before and later."""
+    """Return the bearings after T0, with their errors against images slightly earlier and later."""
     rows = []
     for step in steps:
         frame, usable = step.frame, isinstance(step.measurement.bearing, Bearing)
@@ -164,7 +165,7 @@ def _bearings(steps: Iterable[Step], vision: VisionQuery, t0_s: float) -> HopTab
 
 @dataclass(frozen=True, slots=True)
 class _Halved(Chain):
-    """A chain that is not given every second image."""
+    """A chain that does not receive every second image."""
 
     def source(self, recording: CornerRecording) -> Source:
         source = Chain.source(self, recording)
@@ -176,14 +177,14 @@ class _Halved(Chain):
 def _costs(
     chain: Chain, recording: CornerRecording, boxes: HopTable, min_score: float
 ) -> dict[str, FloatArray]:
-    """Return what the tracks of every method cost in the images that are withheld."""
+    """Return the GOSPA of every method's tracks in the withheld images."""
     steps = _by_image(_Halved(*(getattr(chain, one.name) for one in fields(Chain))), recording)
     log, rows = chain.source(recording).detections, {WORLD: list[FloatArray](), OC_SORT: list[FloatArray]()}
     assert log is not None
     tracks = _oc_sort(boxes, min_score, len(log))
     for image, stamp_ns in list(enumerate(log.stamps_ns.tolist()))[1::2]:
         step, truth = steps.get(_number(seconds(stamp_ns))), boxes.azimuth_rad[_moving_in(boxes, image)]
-        # What has left the view is kept for some seconds, and the camera is not asked about it.
+        # Entities that left the view are kept for some seconds, but the camera is not queried for them.
         there = [] if step is None else _there(step.state, "visible")
         seen = [one.azimuth_rad for one in there if one.visibility.answer != "unqueried"]
         for method, azimuths in ((WORLD, seen), (OC_SORT, tracks[image])) if step else ():
@@ -197,9 +198,9 @@ def _moving_in(boxes: HopTable, image: int) -> IndexArray:
 
 
 def _oc_sort(boxes: HopTable, min_score: float, images: int) -> dict[int, list[float]]:
-    """Return the azimuths of OC-SORT in every second image, which it is not given."""
-    # It steps from one image that it is given to the next: with empty steps between, no track would ever have
-    # the boxes in a row that make it certain. Half of its last motion carries a track to the image between.
+    """Return the azimuths that OC-SORT predicts in every second image, which it does not receive."""
+    # It steps from one received image to the next: with empty steps between, no track would have enough
+    # consecutive boxes to be confirmed. Half of its last motion predicts the track in the image between.
     camera, sort, found = PinholeCamera.ovad(), OcSort(min_score), dict[int, list[float]]()
     last: dict[int, float] = {}
     for image in range(0, images, 2):
@@ -215,9 +216,9 @@ Rows = Callable[[Sequence[Tracked], np.random.Generator], Row]
 
 
 def tracking_figures(found: Sequence[Tracked], rng: np.random.Generator) -> Row:
-    """Return identity, hand-over and bearing error of at least one approach; `tracking` holds the details.
+    """Return identity, hand-over and bearing error of at least one approach; `tracking` has the details.
 
-    Intervals are over recordings, drawn by `rng`; what cannot be stated is None.
+    Intervals are over recordings drawn with `rng`; figures without data are None.
     """
     rows: dict[str, Rows] = {"identity": _identities, "bearing": _bearing_row, "gospa_deg": _gospa_rows}
     names = sorted({one.recording.junction for one in found})
@@ -233,7 +234,7 @@ def tracking_figures(found: Sequence[Tracked], rng: np.random.Generator) -> Row:
 
 
 def _share(name: str, hits: Sequence[bool]) -> Row:
-    """Return a share, its count and its exact interval; None of nothing."""
+    """Return a share, its count and its exact interval; None if there are no cases."""
     n, count = len(hits), sum(hits)
     interval = share_interval(count, n) if n else None
     return {name: mean_of(hits), f"{name}_count": f"{count} of {n}", f"{name}_interval": interval}
@@ -246,7 +247,7 @@ def _pooled(
     rng: np.random.Generator,
     of: Callable[..., Any] = np.median,
 ) -> Row:
-    """Return a figure of the values of all recordings, and its middle over draws of recordings."""
+    """Return a figure over the values of all recordings, with its central interval over draws of them."""
     numbers = [np.asarray(one, np.float64) for one in parts]
     values = np.concatenate([np.empty(0), *numbers])
     if not values.size:
@@ -257,14 +258,14 @@ def _pooled(
 
 
 def _identities(some: Sequence[Tracked], rng: np.random.Generator) -> Row:
-    """Return in how many approaches the entity in view was hidden before, and what the others had."""
+    """Return the share of approaches whose entity in view was hidden before, and the counts of the others."""
     stated = [one.identity for one in some]
     others = {name: stated.count(name) for name in ("another", "none hidden", "no box")}
     return {**_share("kept", [one == "kept" for one in stated]), **others}
 
 
 def _hand_over(some: Sequence[Tracked], rng: np.random.Generator) -> Row:
-    """Return how many vehicles in view become a visible entity, and the delays of those."""
+    """Return how many vehicles in view become a visible entity, and their delays."""
     seen = [one for one in some if not math.isnan(one.delay_s)]
     parts = [np.array([one.delay_s] * math.isfinite(one.delay_s)) for one in seen]
     late = _pooled("late_s", seen, parts, rng, lambda delays_s: np.quantile(delays_s, LATE))
@@ -274,7 +275,7 @@ def _hand_over(some: Sequence[Tracked], rng: np.random.Generator) -> Row:
 
 
 def _before(some: Sequence[Tracked], rng: np.random.Generator) -> Row:
-    """Return how often the riskier side is the vehicle's, and how right the stated times are."""
+    """Return how often the riskier side is the vehicle's, and the errors of the published times."""
     cues = [one.cues for one in some]
     errors = [np.abs(one.best_s - one.before_s) for one in cues]
     stated = [one[np.isfinite(one)] for one in errors]
@@ -321,7 +322,7 @@ def _only_usable(bearings: HopTable) -> HopTable:
 
 
 def _errors(some: Sequence[Tracked], bearings: Sequence[HopTable], rng: np.random.Generator) -> Row:
-    """Return the median error, and squares over the stated variance, whose mean is 1 if it is right."""
+    """Return the median error, and the mean squared error over the published variance, ideally 1."""
     errors = [one.error_rad[:, _NOW] for one in bearings]
     squares = [(error / one.std_rad) ** 2 for error, one in zip(errors, bearings, strict=True)]
     return {
@@ -333,7 +334,7 @@ def _errors(some: Sequence[Tracked], bearings: Sequence[HopTable], rng: np.rando
 
 
 def _gospa_rows(some: Sequence[Tracked], rng: np.random.Generator) -> Row:
-    """Return the mean costs of every method in withheld images with a moving box, and in the others."""
+    """Return the mean GOSPA of every method in withheld images with a moving box, and in the others."""
     found: Row = {}
     for method in (WORLD, OC_SORT):
         costs = [one.costs[method] for one in some]

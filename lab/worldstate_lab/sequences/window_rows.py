@@ -1,6 +1,7 @@
-"""What single windows are worth in the filter, by how they enter it, beside a sequence model that reads them.
+"""Comparison of ways in which single windows enter the filter, alone or through a sequence model.
 
-Each recording is heard once; its measurements then pass through every filter, with the camera and without.
+Each recording is processed once; its measurements then pass through every filter, with and without the
+camera.
 """
 
 from collections.abc import Sequence
@@ -37,11 +38,11 @@ class WindowFilter:
 
     name: str
     windows: Literal["posterior", "likelihood"] = "posterior"
-    sequence: bool = False  # Whether a sequence model reads them first
-    grounded: bool = False  # Whether bearing and approach rate weigh them, eq. (5)
+    sequence: bool = False  # Whether a sequence model is used
+    grounded: bool = False  # Whether bearing and approach rate weight them, eq. (5)
 
     def measured(self, step: Step, camera: bool) -> Measurement:
-        """Return the measurement of a hop as this filter is given it."""
+        """Return the measurement of a hop in the form that this filter receives."""
         one = step.measurement if camera else asked_again(step.measurement, None)
         if self.grounded and one.heard.usable:
             seen = observe(step.frame, one.bearing, one.approach)
@@ -49,7 +50,7 @@ class WindowFilter:
         return one if self.sequence else replace(one, sequence=None)
 
     def trial(self, source: Source, steps: Sequence[Step], recording: CornerRecording, camera: bool) -> Trial:
-        """Return what the filter publishes of a recording."""
+        """Return the states that the filter publishes for a recording."""
         settings = FilterSettings(street=source.street or StreetModel(), windows=self.windows)
         world, rows = WorldFilter(source.context, source.policy, settings), []
         for step in steps:
@@ -76,7 +77,7 @@ FILTERS = (
 
 
 def window_rows(chain: Chain, recordings: Sequence[CornerRecording], seed: int, jobs: int) -> dict[str, Any]:
-    """Return the row of every filter, with the camera and by sound alone."""
+    """Return the row of every filter, with the camera and with sound alone."""
     work = in_processes(partial(_trials, chain), recordings, jobs)
     every = list(track(work, f"listening, {chain.path}", len(recordings)))
     return {
@@ -111,7 +112,7 @@ def _row(trials: Sequence[Trial], rng: np.random.Generator) -> Row:
 
 
 def window_lines(path: str, found: dict[str, Any]) -> list[str]:
-    """Return the rows as a table a camera."""
+    """Return the rows as one table per camera setting."""
     heads = (
         "filter",
         "0.5 s",
