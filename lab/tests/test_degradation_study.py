@@ -411,7 +411,7 @@ def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):
 
 
 def test_settings_that_cannot_be_are_refused():
-    with pytest.raises(InvalidArgumentError, match="names of their own"):
+    with pytest.raises(InvalidArgumentError, match="unique names"):
         DegradationSettings(detectors=(*MOTION, *MOTION))
 
 

@@ -240,7 +240,7 @@ def test_windows_of_a_tested_recording_are_left_out_or_refused(streets, tmp_path
     tested = tuple(Take(tmp_path / t.name, t.name, t.site, t.label, T0_S) for t in streets[3:12])
     kept, said = windows_from_table(tmp_path / "windows.csv", TakeList(tmp_path, tested, (), (), False))
     assert set(kept.ids.tolist()) == {t.name for t in (*streets[:3], *streets[12:])}
-    assert "9 of tested recordings left out" in said
+    assert "9 of test recordings left out" in said
     with pytest.raises(InvalidArgumentError, match="left03"):
         Classifiers(table_of(streets)).classify("all", streets[:3], streets[3:4], 1)
 

@@ -225,7 +225,7 @@ def test_recordings_are_chosen_evenly_and_what_is_missing_is_named(tmp_path):
     few = sweep_data([*whole[:2], dark, moving], approaches=3, hazard_free=2)
     assert few.approaches == tuple(whole[:2])
     assert few.missing == (
-        f"1 of 3 filmed approaches are missing: no {VIDEO_NAME} or no detections beside leftSA19",
+        f"1 of 3 approaches with video are missing: no {VIDEO_NAME} or no detections beside leftSA19",
         "2 of 2 filmed hazard-free recordings are missing",
     )
     assert "hazard-free recordings are missing" in few.lacks

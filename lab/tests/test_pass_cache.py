@@ -85,7 +85,7 @@ def test_a_damaged_file_is_made_again_with_a_warning(damage, tmp_path):
     cache.tables("sound", 1, some_tables)
     [path] = tmp_path.rglob("*.npz")
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.warns(UserWarning, match="made again"):
+    with pytest.warns(UserWarning, match="computed again"):
         assert_same(cache.tables("sound", 1, some_tables), some_tables())
     assert_same(cache.tables("sound", 1, never), some_tables())
 
@@ -146,7 +146,7 @@ def test_tables_of_another_pass_under_the_name_are_made_again(tmp_path):
     for suffixes in ([".npz"], [".npz", ".sum"]):
         for suffix in suffixes:
             mine.with_suffix(suffix).write_bytes(other.with_suffix(suffix).read_bytes())
-        with pytest.warns(UserWarning, match="made again"):
+        with pytest.warns(UserWarning, match="computed again"):
             assert_same(cache.tables("sound", 1, some_tables), some_tables())
 
 

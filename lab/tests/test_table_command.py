@@ -102,7 +102,7 @@ def test_partial_data_are_refused_with_what_is_missing(smoke, tmp_path, capsys):
     started = time.monotonic()
     assert main(["table", str(broken), "--out", str(tmp_path / "no")]) == 2
     said = capsys.readouterr().err
-    assert said.count("out_multi.wav") == 4 and "4 things are missing" in said
+    assert said.count("out_multi.wav") == 4 and "4 required items are missing" in said
     assert main(["table", str(tmp_path), "--out", str(tmp_path / "no")]) == 2
     assert "DataLog.csv" in capsys.readouterr().err
     assert main(["table", str(broken), "--stage-streams", "--out", str(tmp_path / "no")]) == 2

@@ -1,1 +1,1 @@
-"""Hazard awareness while the camera fails."""
+"""Hazard awareness with a degraded camera."""

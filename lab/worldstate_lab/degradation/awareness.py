@@ -1,4 +1,4 @@
-"""Hazard awareness beside vision alone, and false alarms beside those of the clean recording."""
+"""Hazard awareness compared with vision alone, and false alarms compared with the clean recording."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from worldstate_lab.metrics.stream_statistic import stream_statistic
 
 from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions
 
-# One recording by the name of its condition, with the columns of `staged_filter.filter_in_conditions`.
+# One recording by name of the condition, with the columns of `staged_filter.filter_in_conditions`.
 Staged = Mapping[str, HopTable]
 
 
@@ -33,7 +33,7 @@ ALPHA = 0.02
 
 
 class Estimate(NamedTuple):
-    """A figure with the ends of its 95 % interval."""
+    """A figure with the bounds of its 95 % interval."""
 
     value: float
     low: float
@@ -42,55 +42,55 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AwarenessRow:
-    """One condition; None where the recordings hold nothing to form a figure from."""
+    """One condition; a figure is None if the recordings contain no data for it."""
 
     condition: Condition
-    degradation: float  # Mean d that was estimated
-    miss_rate: float | None  # Mean beta of the channel where it was asked after T0
-    vision: Estimate  # Share of the hops after T0, vehicle in view, in which it is detected: 1 - beta
-    any_detection: float  # Share of them in which anything that moves is detected
-    # Share of them in which it is detected or P(hidden) + P(visible) is above its threshold.
+    degradation: float  # Mean estimated d
+    miss_rate: float | None  # Mean beta of the camera channel over its queries after T0
+    vision: Estimate  # Share of the hops after T0 with the vehicle in view in which it is detected: 1 - beta
+    any_detection: float  # Share of these hops in which any moving object is detected
+    # Share of these hops in which it is detected or P(hidden) + P(visible) is above its threshold.
     awareness: Estimate
-    # Awareness in the hops in which it is not detected: what the sound holds by itself.
+    # Awareness in the hops in which it is not detected: the contribution of the sound.
     unseen_awareness: float | None
-    detected: float  # Share of approaches with an advisory in the 5 s before T0, and by how much in the mean
+    detected: float  # Share of approaches with an advisory in the 5 s before T0, and their mean lead time
     lead_time_s: float | None
-    # Advisories on hazard-free recordings, and the times that the awareness rises on them, for sound or for a
-    # false detection; intervals are those of a Poisson count.
+    # Advisories on hazard-free recordings, and onsets of awareness on them, caused by sound or by a false
+    # detection; intervals are those of a Poisson count.
     false_alarms_per_hour: Estimate
     false_awareness_per_hour: Estimate
-    # Share of their hops in awareness: where the hours are few, steadier than the count of its rises.
+    # Share of their hops in awareness: with few hours, less noisy than the count of onsets.
     false_awareness: float
 
 
 @dataclass(frozen=True, slots=True)
 class CommonCause:
-    """What rain takes that soils the lens and drums on the roof at once, beside its two effects alone.
+    """Loss of awareness in rain, which degrades camera and microphones together, and in each effect alone.
 
-    Were the two sensors degraded independently, as assumption (A1) says, what each effect takes from the
-    awareness would add up.
+    If the two sensors were degraded independently, as assumption (A1) states, the losses of awareness would
+    add up.
     """
 
     level: int
-    noise_db: float  # Over the recording's own level
-    lens: Estimate  # Awareness with a soiled lens
-    roof: Estimate  # With rain on the roof
+    noise_db: float  # Relative to the recording's own level
+    lens: Estimate  # Awareness with rain on the lens only
+    roof: Estimate  # With rain on the roof only
     rain: Estimate  # With both
-    additive: Estimate  # Clean, less what each takes alone
-    optimism: Estimate  # By how much that is above what is left: positive where (A1) says too much
+    additive: Estimate  # Clean minus the loss of each effect alone
+    optimism: Estimate  # `additive` minus `rain`: positive if (A1) is too optimistic
 
 
 @dataclass(frozen=True, slots=True)
 class Awareness:
-    """All conditions, judged by the same thresholds."""
+    """All conditions, evaluated with the same thresholds."""
 
     rows: tuple[AwarenessRow, ...]
     common_cause: tuple[CommonCause, ...]
-    hops_in_view: int  # After T0, that awareness stands on
-    hazard_free_hours: float  # That false alarms stand on
+    hops_in_view: int  # After T0, from which awareness is computed
+    hazard_free_hours: float  # From which false alarms are computed
 
     def row(self, name: str) -> AwarenessRow:
-        """Return the row of a condition by its name."""
+        """Return the row of a condition."""
         return next(row for row in self.rows if row.condition.name == name)
 
 
@@ -101,12 +101,12 @@ def hazard_awareness(
     draws: IndexArray,
     rng: np.random.Generator,
 ) -> Awareness:
-    """Judge every condition by the same thresholds.
+    """Evaluate every condition with the same thresholds.
 
-    Both are set on other recordings' hazard-free hops: gamma(alpha) of the advisory's statistic on the clean
-    ones, as that only falls when absence says less; and that of P(hidden) + P(visible) without a camera, as
-    that only rises. The statistic is formed at `prior` and has to hold for `sustain_hops`. `draws` (draws,
-    recordings) says which recordings make each draw of an interval.
+    Both thresholds are set on hazard-free hops of other recordings: gamma(alpha) of the advisory's statistic
+    on the clean recordings, because the statistic only falls if absence is weaker evidence; and that of
+    P(hidden) + P(visible) without a camera, because it only rises then. The statistic uses `prior` and must
+    be above its threshold for `sustain_hops`. `draws` (draws, recordings) lists the recordings of each draw.
     """
     clean = [one[CLEAN] for one in recordings]
     if not any(one.after_sight().any() for one in clean):
@@ -140,12 +140,12 @@ class _Judged:
 
     @property
     def aware(self) -> BoolArray:
-        """Of a vehicle that is there: a detection of something else is no awareness of it."""
+        """Awareness of the vehicle in view: a detection of another object does not count."""
         return np.asarray(self.recording.found | self.heard)
 
     @property
     def raised(self) -> BoolArray:
-        """Where nothing is there, any detection raises awareness."""
+        """Awareness without a vehicle: any detection counts."""
         return np.asarray(self.recording.seen | self.heard)
 
     def in_sight(self, flags: AnyArray) -> BoolArray:
@@ -154,7 +154,7 @@ class _Judged:
 
 
 class _Counts:
-    """Hops after T0 of every recording, and those of them detected and aware; shares on any draw."""
+    """Hops after T0 of every recording, with the detected and the aware ones; gives shares for any draw."""
 
     def __init__(self, judged: Sequence[_Judged], draws: IndexArray) -> None:
         flags = [(one.in_sight(one.recording.found), one.in_sight(one.aware)) for one in judged]
@@ -163,21 +163,21 @@ class _Counts:
         self._draws = draws
 
     def vision(self) -> tuple[float, FloatArray]:
-        """Share that is detected, of all recordings and of every draw."""
+        """Share of detected hops, over all recordings and in every draw."""
         return self._share(self._found)
 
     def awareness(self) -> tuple[float, FloatArray]:
-        """Share in awareness, of all recordings and of every draw."""
+        """Share of aware hops, over all recordings and in every draw."""
         return self._share(self._aware)
 
     def _share(self, part: FloatArray) -> tuple[float, FloatArray]:
         hops, drawn = self._hops[self._draws].sum(axis=1), part[self._draws].sum(axis=1)
-        # A draw without anything in view has no share; `middle` leaves it out.
+        # A draw without a vehicle in view has no share; `middle` leaves it out.
         return float(part.sum() / self._hops.sum()), ratio(drawn, hops)
 
 
 def _judge(others: Sequence[Staged], prior: Sequence[float], hops: int) -> Callable[[HopTable], _Judged]:
-    """Set the two thresholds of a fold on the recordings of the others."""
+    """Set the two thresholds of a fold on the recordings of the other folds."""
     free = [one for one in others if one[CLEAN].hazard_free]
     calm = [stream_statistic(one[CLEAN], prior) for one in free]
     gamma = neyman_pearson_threshold(calm, ALPHA, hops)

@@ -1,4 +1,4 @@
-"""Miss rates of a detector over azimuth and degradation, with their spread over recordings."""
+"""Miss rates of a detector over azimuth and degradation, with intervals over recordings."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,16 +21,16 @@ from worldstate_lab.metrics.intervals import draw_weights, middle, ratio
 
 from .conditions import FAMILIES, at_level, detections_in, health_of
 
-# How misses are counted in every sweep, so that rates are those of `measure-absence`.
+# Misses are counted as in `measure-absence`, in every sweep.
 SETTINGS = AbsenceSettings(families=FAMILIES)
-# With fewer looks, one vehicle more or less in a bin moves its rate by more than what is compared.
+# With fewer looks, a single vehicle changes the rate of a bin by more than the compared differences.
 FEWEST_LOOKS = 20
 
 Counts = Mapping[str, FamilyCounts]
 
 
 class Band(NamedTuple):
-    """Values with the middle 95 % over recordings drawn again, arrays of one shape."""
+    """Values with the central 95 % over resampled recordings, arrays of one shape."""
 
     value: FloatArray
     low: FloatArray
@@ -39,7 +39,7 @@ class Band(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Fall:
-    """A place at which beta falls where it ought to rise.
+    """A step at which beta decreases although it should increase.
 
     Examples
     --------
@@ -48,40 +48,40 @@ class Fall:
     """
 
     along: Literal["degradation", "azimuth"]
-    where: str  # The step at whose end it is lower than at its start
+    where: str  # Description of the step
     by: float
-    low: float  # Middle 95 % over recordings drawn again
+    low: float  # Central 95 % over resampled recordings
     high: float
 
     @property
     def certain(self) -> bool:
-        """Whether no draw of the middle 95 % shows a rise."""
+        """Whether the central 95 % of the draws contain no increase."""
         return self.low > 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BetaCurves:
-    """beta(theta, d) of one detector as it was counted: misses over looks, NaN without a look."""
+    """Measured beta(theta, d) of one detector: misses divided by looks, NaN without a look."""
 
-    azimuth_deg: tuple[float, ...]  # Edges of the bins off the optical axis
+    azimuth_deg: tuple[float, ...]  # Edges of the bins, angle to the optical axis
     looks: FloatArray  # shape (families, bins, levels)
-    by_azimuth: Band  # Same shape; families as in `FAMILIES`, level 0 the clean camera
+    by_azimuth: Band  # Same shape; families as in `FAMILIES`, level 0 is the clean camera
     overall: Band  # shape (families, levels): All azimuths
-    falls: tuple[Fall, ...]  # The largest first
+    falls: tuple[Fall, ...]  # Largest first
 
     @property
     def bins(self) -> tuple[str, ...]:
-        """The azimuth bins in words."""
+        """The azimuth bins as text."""
         edges = self.azimuth_deg
         return tuple(f"{low:.0f}-{high:.0f} deg" for low, high in pairwise(edges))
 
 
 def absence_counts(reference: DetectionLog, boxes: HopTable) -> dict[str, FamilyCounts]:
-    """Count what a detector missed of the reference of one recording, in every condition."""
+    """Count the misses of a detector against the reference of one recording, in every condition."""
     tally = AbsenceTally(PinholeCamera.ovad(), SETTINGS)
     for family in FAMILIES:
         for level in range(len(LEVELS)):
-            # The clean camera belongs to every family and is counted once.
+            # The clean camera belongs to every family but is counted once.
             if level or family == FAMILIES[0]:
                 for number, found in enumerate(detections_in(boxes, at_level(family, level).name).frames):
                     tally.count(reference, number, found, family, level)
@@ -89,7 +89,7 @@ def absence_counts(reference: DetectionLog, boxes: HopTable) -> dict[str, Family
 
 
 def counts_table(counts: Counts) -> HopTable:
-    """Return counts as a table for a cache: a row an azimuth bin of each family, its last one of clutter."""
+    """Return counts as a table for a cache: one row per family and azimuth bin, the last for clutter."""
     rows = [
         (family, *row)
         for family, one in counts.items()
@@ -99,7 +99,7 @@ def counts_table(counts: Counts) -> HopTable:
 
 
 def counts_of(table: HopTable) -> dict[str, FamilyCounts]:
-    """Return what `counts_table` was made of."""
+    """Return the counts from a table of `counts_table`."""
     counts = {}
     for family in FAMILIES:
         chosen = table.family == family
@@ -111,7 +111,7 @@ def counts_of(table: HopTable) -> dict[str, FamilyCounts]:
 def pooled_rates(
     counts: Sequence[Counts], readings: Sequence[HopTable], provenance: Mapping[str, str]
 ) -> MissRates:
-    """Return the miss rates that several recordings give together, with the scale of their camera."""
+    """Return the miss rates of several recordings together, with the health scale of their camera."""
     families: dict[str, FamilyCounts] = {
         family: reduce(add, [one[family] for one in counts]) for family in FAMILIES
     }
@@ -124,7 +124,7 @@ def pooled_rates(
 
 
 def beta_curves(counts: Sequence[Counts], draws: IndexArray) -> BetaCurves:
-    """Return the curves of all recordings; `draws` (draws, recordings) says which make each draw."""
+    """Return the curves of all recordings; `draws` (draws, recordings) lists the recordings of each draw."""
     edges = SETTINGS.edges_deg(PinholeCamera.ovad())
     looks, misses = (
         np.array([[getattr(one[family], name) for family in FAMILIES] for one in counts])

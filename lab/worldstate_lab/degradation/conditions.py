@@ -1,6 +1,6 @@
-"""What is staged on the camera, on the microphones, or on both at once, and what detectors report of it.
+"""Staged degradations of camera, microphones or both, and the reports of detectors under them.
 
-A look at one video by several detectors in every condition is the expensive part, and kept.
+Running several detectors over one video in every condition is the expensive step, so its results are cached.
 """
 
 import io
@@ -44,13 +44,13 @@ from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.ground.values import nanoseconds
 from worldstate.operations.recordings.hop_table import HopTable
 
-# Conditions that every sweep has: the recording as it is, and no camera at all.
+# Conditions of every sweep: the unchanged recording, and no camera.
 CLEAN, OFF = "clean", "off"
-# Rain has two effects: it soils the lens and it drums on the roof. Each is staged alone as well.
+# Rain has two effects: water on the lens and noise on the roof. Each is also staged alone.
 LENS, ROOF, RAIN = "lens", "roof", "rain"
-# The three families of the paper; those measured as miss rates, as the camera is not told that it rains.
+# The three families of the paper. Miss rates are measured for these only: the camera has no rain sensor.
 FAMILIES: tuple[Family, ...] = ("blur", "darkness", "noise")
-# What an image goes through, optics first. Drops on a lens smear the image and take some of its light.
+# Processing steps of an image, optics first. Drops on a lens blur the image and reduce its light.
 STAGES: Mapping[str, tuple[Family, ...]] = MappingProxyType(
     {CLEAN: (), **{family: (family,) for family in FAMILIES}, LENS: ("blur", "darkness")}
 )
@@ -58,7 +58,7 @@ STAGES: Mapping[str, tuple[Family, ...]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One level of one family; level 0 for those without levels.
+    """One level of one family; level 0 for families without levels.
 
     Examples
     --------
@@ -74,7 +74,7 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """Unique in a sweep."""
+        """Name that is unique in a sweep."""
         return f"{self.family} {self.degradation:g}" if self.level else self.family
 
     @property
@@ -84,14 +84,14 @@ class Condition:
 
     @property
     def camera(self) -> "Condition":
-        """The condition whose images these are."""
+        """The condition of the camera alone, which has the same images."""
         if self.family in STAGES:
             return self
         return Condition(LENS, self.level) if self.family == RAIN else Condition(CLEAN)
 
     @property
     def sound_level(self) -> int:
-        """Level of the rain on the roof, 0 without."""
+        """Level of the rain on the roof, 0 if there is none."""
         return self.level if self.family in (ROOF, RAIN) else 0
 
     def stage(self, image: ImageArray, rng: np.random.Generator, reduced: float = 1.0) -> ImageArray:
@@ -104,21 +104,21 @@ class Condition:
 def degrade_reduced(
     image: ImageArray, family: Family, degradation: float, rng: np.random.Generator, reduced: float
 ) -> ImageArray:
-    """Return a reduced image as if it had been reduced after the degradation.
+    """Degrade a reduced image as if the full image had been degraded and then reduced.
 
-    `reduced` is the number of the camera's pixels per side of one of the image, whose mean it holds.
+    Each pixel of the image is the mean of `reduced` x `reduced` pixels of the camera.
     """
-    # A detector that works on a reduced image sees the same either way, for a tenth of the time: blur and
-    # darkness commute with the mean over pixels, and of the noise only the mean over pixels is left.
+    # For a detector on reduced images the result is the same, at a tenth of the time: blur and darkness
+    # commute with the mean over pixels, and the noise enters only by its mean over pixels.
     if reduced == 1.0 or family == "darkness" or degradation == 0.0:
         return degrade(image, family, degradation, rng)
     staged = strength(family, degradation)
     if family == "blur":
         return blurred(image, staged / reduced, rng)
-    # Clipping moves the mean of a dark or bright pixel and narrows its noise, before the mean is taken.
+    # Clipping occurs before the mean: it shifts the mean of a dark or bright pixel and reduces its noise.
     mean, std = _clipped_noise(staged)
-    # Cells that do not lie on whole pixels share those at their edges: the mean square of the weights of
-    # cells anywhere is (r - 1/3) / r^2 a side.
+    # Cells that are not aligned with whole pixels share the pixels at their edges: the mean square of the
+    # weights of randomly placed cells is (r - 1/3) / r^2 per side.
     left = 1.0 / reduced if reduced.is_integer() else (reduced - 1.0 / 3.0) / reduced**2
     drawn = normal_quantiles().take(rng.integers(0, QUANTILES, image.shape, dtype=np.uint16))
     values = drawn * (std * np.float32(left)).take(image) + mean.take(image)
@@ -127,7 +127,7 @@ def degrade_reduced(
 
 @lru_cache(maxsize=16)
 def _clipped_noise(sigma: float) -> tuple[Float32Array, Float32Array]:
-    """Mean and standard deviation of each grey level with noise, as a camera stores it; shape (256,)."""
+    """Return mean and standard deviation of each stored grey level with noise, shape (256,) each."""
     grey = np.arange(256.0)
     edges = ndtr((grey[:-1] + 0.5 - grey[:, None]) / sigma)
     share = np.diff(edges, axis=1, prepend=0.0, append=1.0)
@@ -146,7 +146,7 @@ def at_level(family: str, level: int) -> Condition:
 
 
 def all_conditions() -> tuple[Condition, ...]:
-    """Return those of the camera, those of the sound, both at once, and no camera.
+    """Return the conditions of the camera, of the sound, of both together, and no camera.
 
     Examples
     --------
@@ -160,16 +160,17 @@ def _levels(*families: str) -> list[Condition]:
     return [Condition(family, level) for family in families for level in range(1, len(LEVELS))]
 
 
-# White noise over a recording's own level at the levels of d, dB. Most of that level lies below 100 Hz, where
-# no evidence is: at -20 dB the noise is 17 dB below a street between .3 and 1 kHz, at +10 dB 13 dB above.
+# White noise relative to the recording's own level at the levels of d, in dB. Most of that level is below 100
+# Hz, which is not used as evidence: at -20 dB the noise is 17 dB below a street's level between 0.3 and 1
+# kHz, at +10 dB it is 13 dB above.
 RAIN_DB = (-np.inf, -20.0, -10.0, 0.0, 10.0)
 
 
 def rained(source: Source, level: int, dry_rms: float, rng: np.random.Generator) -> Source:
-    """Return a source to be heard once, with rain on the roof over its sound, whose `level_rms` is `dry_rms`.
+    """Return a source that can be read once, with rain on the roof; `dry_rms` is its `level_rms`.
 
-    Drops fall on each microphone's surroundings by themselves: unlike wind or traffic, what they add is not
-    coherent between microphones.
+    Drops hit the surroundings of each microphone independently: unlike wind or traffic noise, this noise is
+    not coherent between microphones.
     """
     noise_rms = dry_rms * 10.0 ** (RAIN_DB[level] / 20.0)
     audio = open_sound(source.sound)
@@ -189,7 +190,7 @@ def level_rms(source: Source) -> float:
 
 
 class _Rain(io.RawIOBase):
-    """Bytes of a sound with noise, block by block: a stream of an hour is never in memory."""
+    """Bytes of a sound with added noise, block by block: a stream of an hour does not fit in memory."""
 
     def __init__(self, audio: Audio, noise_rms: float, rng: np.random.Generator) -> None:
         self._audio, self._noise_rms, self._rng = audio, np.float32(noise_rms), rng
@@ -197,11 +198,11 @@ class _Rain(io.RawIOBase):
         self._left = memoryview(b"")
 
     def readable(self) -> bool:
-        """Bytes can be read."""
+        """Return True: the bytes are readable."""
         return True
 
     def readinto(self, buffer: memoryview, /) -> int:  # type: ignore[override]
-        """Fill as much of the buffer as one block has left."""
+        """Fill the buffer with as much as the current block still contains."""
         if not self._left and (block := next(self._blocks, None)) is not None:
             noise = self._rng.standard_normal(block.shape, dtype=np.float32) * self._noise_rms
             self._left = memoryview((block + noise).astype("<f4").tobytes())
@@ -210,16 +211,17 @@ class _Rain(io.RawIOBase):
         return n
 
     def close(self) -> None:
-        """Close the sound as well."""
+        """Close the underlying sound too."""
         self._audio.close()
         super().close()
 
 
-# Changes whenever the same video would give other detections.
+# Increased whenever the same video would give different detections.
 VERSION = 1
-# What is staged does not change within a recording, and reading it costs as much as two detections.
+# The staged degradation is constant within a recording, and estimating it costs as much as two detections.
 HEALTH_PERIOD_S = 2.0
-# Around the part of an image that its quality is read from: the widest blur, 16 px, ends at three of them.
+# Margin around the part of an image in which quality is measured: three standard deviations of the widest
+# blur, 16 px.
 _MARGIN_PX = 48
 READINGS = "readings"
 _BOX_COLUMNS = ("condition", "frame", "box_px", "score", "class_name")
@@ -228,7 +230,7 @@ _READING_COLUMNS = ("condition", "time_s", "brightness", "noise", "sharpness")
 
 @dataclass(frozen=True, slots=True)
 class StagedDetector:
-    """A detector to be tried in every condition.
+    """A detector to be evaluated in every condition.
 
     Examples
     --------
@@ -236,13 +238,13 @@ class StagedDetector:
     ['mog2', 'knn']
     """
 
-    name: str  # In tables and files; with the name of its model
-    make: Callable[[], Detector]  # A new one for every video and condition, in any process
-    keep: DetectionFilter = field(default_factory=any_motion)  # Which of its boxes count
+    name: str  # In tables and files; includes the name of its model
+    make: Callable[[], Detector]  # Returns a new detector for each video and condition, in any process
+    keep: DetectionFilter = field(default_factory=any_motion)  # Filter for its boxes
 
 
 def motion_detectors() -> tuple[StagedDetector, ...]:
-    """Return background subtraction by mixtures and by neighbours, which need no model."""
+    """Return background subtraction by mixtures and by neighbours, which need no model file."""
     kinds: tuple[Background, ...] = ("mog2", "knn")
     return tuple(StagedDetector(kind, partial(MotionDetector, kind)) for kind in kinds)
 
@@ -254,9 +256,10 @@ def look(
     width_px: int,
     conditions: Sequence[Condition] = camera_conditions(),
 ) -> dict[str, HopTable]:
-    """Decode once, degrade once a condition, and ask every detector.
+    """Decode a video once, degrade it once per condition, and run every detector.
 
-    One table a detector holds its boxes in pixels of OVAD's camera, and `READINGS` the quality of the images.
+    The result has one table per detector with its boxes in pixels of OVAD's camera, and `READINGS` with the
+    image quality.
     """
     makers = {(one.name, state): one.make() for one in detectors for state in conditions}
     boxes: dict[str, list[tuple[object, ...]]] = {one.name: [] for one in detectors}
@@ -280,7 +283,7 @@ def look(
 
 
 def _reported(found: DetectionFrame, image: ImageArray) -> Iterator[tuple[FloatArray, float, str]]:
-    """Yield the boxes in pixels of OVAD's camera, whatever the size of the image."""
+    """Yield the boxes in pixels of OVAD's camera, for any size of the image."""
     height, width = image.shape[:2]
     whole = PinholeCamera.ovad()
     scale = np.array([whole.width_px / width, whole.height_px / height] * 2)
@@ -293,10 +296,10 @@ def _measures(quality: ImageQuality) -> tuple[float, float, float]:
 
 
 def detections_in(looks: HopTable, condition: str) -> DetectionLog:
-    """Return what a detector reported in one condition, empty images included."""
+    """Return the detections in one condition, empty images included."""
     n = int(looks.about["frames"])
     chosen = looks.condition == condition
-    # An empty column has no shape of its own, and no text in it.
+    # An empty column has neither the right shape nor the text type.
     boxes, scores = looks.box_px[chosen].reshape(-1, 4), looks.score[chosen]
     labels = looks.class_name[chosen].tolist()
     edges = np.searchsorted(looks.frame[chosen], np.arange(n + 1)).tolist()
@@ -305,7 +308,7 @@ def detections_in(looks: HopTable, condition: str) -> DetectionLog:
 
 
 def health_of(readings: Sequence[HopTable]) -> CameraHealth:
-    """Return the scale of d that the images of several recordings give."""
+    """Return the scale of d from the images of several recordings."""
     levels = range(len(LEVELS))
     noise = [_measured(readings, at_level("noise", level), "noise") for level in levels]
     sharpness = [_measured(readings, at_level("blur", level), "sharpness") for level in levels]
@@ -314,7 +317,7 @@ def health_of(readings: Sequence[HopTable]) -> CameraHealth:
 
 
 def degradation_in(readings: HopTable, condition: str, rates: MissRates) -> DegradationLog:
-    """Return d as the camera's own images show it, without what is staged."""
+    """Return d as estimated from the camera's own images, without knowledge of the staged degradation."""
     if rates.health is None:
         raise InvalidArgumentError("rates: expected miss rates with the camera's scale of health")
     monitor, chosen = HealthMonitor(rates.health), readings.condition == condition
@@ -332,7 +335,7 @@ def _measured(readings: Sequence[HopTable], condition: Condition, name: str) -> 
 
 
 def _centre(frame: ImageArray) -> ImageArray:
-    """Return the part of an image that its quality is read from, in the colour that it is read in."""
+    """Return the part of an image in which quality is measured, in the required colour space."""
     side = LARGEST_PX + 2 * _MARGIN_PX
     top, left = (max((length - side) // 2, 0) for length in frame.shape[:2])
     return np.ascontiguousarray(frame[top : top + side, left : left + side, 1])
@@ -340,7 +343,7 @@ def _centre(frame: ImageArray) -> ImageArray:
 
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV on the calling thread: recordings are what is worked on side by side."""
+    """Restrict OpenCV to the calling thread: the parallel processes work on different recordings."""
     cv2 = optional("cv2")
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

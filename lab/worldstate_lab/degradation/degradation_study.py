@@ -1,4 +1,4 @@
-"""The degradation sweep of the paper: miss rates of two detectors, and awareness while the camera fails."""
+"""The paper's degradation sweep: miss rates of two detectors, and awareness with a degraded camera."""
 
 import zlib
 from collections import Counter
@@ -35,13 +35,13 @@ from .beta_curves import (
 from .conditions import FAMILIES, RAIN_DB, READINGS, StagedDetector, look, motion_detectors
 from .staged_filter import by_condition, cameras, filter_in_conditions
 
-# Of each kind: with fewer, no recording is left to set thresholds and miss rates on.
+# Minimum of each kind: with fewer, no recording remains on which to set thresholds and miss rates.
 LEAST = 2
 
 
 @dataclass(frozen=True, slots=True)
 class SweepData:
-    """Recordings of a sweep, and in words what there ought to be more of."""
+    """Recordings of a sweep, and descriptions of recordings that are missing."""
 
     approaches: tuple[Recording, ...]
     hazard_free: tuple[Recording, ...]
@@ -49,20 +49,20 @@ class SweepData:
 
     @property
     def recordings(self) -> tuple[Recording, ...]:
-        """Both kinds."""
+        """Approaches and hazard-free recordings."""
         return *self.approaches, *self.hazard_free
 
     @property
     def lacks(self) -> str | None:
-        """What a sweep needs and does not find; None where it can be run."""
+        """The data that a sweep needs and that are missing; None if it can be run."""
         if min(len(self.approaches), len(self.hazard_free)) >= LEAST:
             return None
-        least = f"needs {LEAST} filmed approaches and {LEAST} filmed hazard-free recordings"
+        least = f"needs {LEAST} approaches and {LEAST} hazard-free recordings with video"
         return f"{least}; {'; '.join(self.missing)}"
 
 
 def sweep_data(recordings: Sequence[Recording], approaches: int = 12, hazard_free: int = 12) -> SweepData:
-    """Choose so many filmed recordings of a standing ego of each kind, evenly over junctions and sides.
+    """Choose recordings with video and a standing ego of each kind, evenly over junctions and sides.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def sweep_data(recordings: Sequence[Recording], approaches: int = 12, hazard_fre
     wanted = approaches, hazard_free
     filmed = [[one for one in found if _usable(one)] for found in of_kind]
     missing = [
-        f"{number - len(usable)} of {number} filmed {name} are missing" + _why(found)
+        f"{number - len(usable)} of {number} {name} with video are missing" + _why(found)
         for name, number, usable, found in zip(names, wanted, filmed, of_kind, strict=True)
         if len(usable) < number
     ]
@@ -83,7 +83,7 @@ def sweep_data(recordings: Sequence[Recording], approaches: int = 12, hazard_fre
 
 
 def _usable(recording: Recording) -> bool:
-    # From a moving camera every box moves: there is no reference there.
+    # With a moving camera every box moves, so there is no reference.
     standing = not recording.moving_ego and recording.label is not None
     return standing and recording.detections_path is not None and (recording.path / VIDEO_NAME).is_file()
 
@@ -97,46 +97,47 @@ def _why(found: Sequence[Recording]) -> str:
 
 
 def _evenly(recordings: Sequence[Recording], number: int) -> list[Recording]:
-    """Take one of each junction and side in turn; kept in the order of the data set."""
+    """Take one recording of each junction and side in turn; the order of the data set is kept."""
     taken: Counter[tuple[str | None, str | None]] = Counter()
     ranked = []
     for place, one in enumerate(recordings):
         stratum = (one.environment, one.label)
-        # By side before the junction, so that a remainder goes to as many junctions as it can.
+        # Side before junction, so that a remainder is spread over as many junctions as possible.
         ranked.append((taken[stratum], one.label or "", place))
         taken[stratum] += 1
     return [recordings[place] for place in sorted(place for *_, place in sorted(ranked)[:number])]
 
 
 Tables = Mapping[str, HopTable]
-# Keeps what a pass over a recording gave: name of the pass, what it depends on, and how to make it.
+# Caches the result of a pass over a recording: name of the pass, the data that it depends on, and a function
+# that computes it.
 Keep = Callable[[str, object, Callable[[], Tables]], Tables]
-# Does the work on every item, in order; text is the problem of a recording that failed.
+# Applies a function to every item, in order; a text result describes why a recording failed.
 Over = Callable[[Callable[["SweepItem"], Tables], Sequence["SweepItem"]], Iterable[Tables | str]]
 
 
 @dataclass(frozen=True, slots=True)
 class DegradationSettings:
-    """What is swept.
+    """Options of a sweep.
 
     Parameters
     ----------
     detectors : tuple of StagedDetector
-        Tried in every condition; both kinds of background subtraction by default.
+        Detectors run in every condition; by default two kinds of background subtraction.
     model : Path, optional
-        Signature model; the one that ships where not given.
+        Signature model; by default the shipped one.
     approaches, hazard_free : int
-        Recordings of each kind.
+        Number of recordings of each kind.
     width_px : int
-        Images are reduced to this width once, before anything is staged; detectors then find them small
-        enough.
+        Images are reduced to this width once, before degradation, so that detectors need not reduce them
+        further.
     seed : int
-        Noise, folds and intervals.
+        Seed of noise, folds and intervals.
 
     Raises
     ------
     InvalidArgumentError
-        If a number is out of range or two detectors have one name.
+        If a number is out of range or two detectors have the same name.
 
     Examples
     --------
@@ -154,13 +155,13 @@ class DegradationSettings:
     def __post_init__(self) -> None:
         names = {one.name for one in self.detectors}
         if not names or len(names) < len(self.detectors) or READINGS in names:
-            raise InvalidArgumentError(f"detectors: expected names of their own, got {sorted(names)}")
+            raise InvalidArgumentError(f"detectors: expected unique names, got {sorted(names)}")
         in_range("width_px", self.width_px, 64, 8192)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectorSweep:
-    """Everything about one detector."""
+    """Miss rates and awareness of one detector."""
 
     detector: str
     beta: BetaCurves
@@ -168,16 +169,16 @@ class DetectorSweep:
 
     @property
     def least_awareness(self) -> AwarenessRow:
-        """The condition of the paper's sweep in which awareness is least."""
+        """The condition of the paper's sweep with the lowest awareness."""
         return min(self._paper(), key=lambda row: row.awareness.value)
 
     @property
     def least_vision(self) -> AwarenessRow:
-        """The condition of the paper's sweep in which vision alone is least."""
+        """The condition of the paper's sweep with the lowest awareness of vision alone."""
         return min(self._paper(), key=lambda row: row.vision.value)
 
     def family(self, name: str) -> list[AwarenessRow]:
-        """Return the clean row and those of a family, by level."""
+        """Return the clean row and the rows of a family, by level."""
         rows = self.awareness.rows
         return [rows[0], *(row for row in rows if row.condition.family == name)]
 
@@ -194,13 +195,13 @@ class DegradationStudy:
     sweeps : tuple of DetectorSweep
         In the order of the settings.
     approaches, hazard_free : tuple of str
-        Recordings that the figures stand on.
+        Names of the recordings used.
     skipped : mapping of str to str
-        Recordings that failed, and why.
+        Recordings that failed, with the reason.
     missing : tuple of str
-        What there ought to be more of, in words.
+        Descriptions of missing recordings.
     settings : DegradationSettings
-        As they were given.
+        The options of the sweep.
     """
 
     sweeps: tuple[DetectorSweep, ...]
@@ -212,19 +213,19 @@ class DegradationStudy:
 
     @property
     def beta_shift(self) -> float:
-        """Mean over families and levels of the last detector's beta less that of the first."""
+        """Mean over families and levels of the last detector's beta minus that of the first."""
         first, last = (sweep.beta.overall.value for sweep in (self.sweeps[0], self.sweeps[-1]))
         return float(np.nanmean(last - first))
 
     @property
     def largest_awareness_difference(self) -> float:
-        """Over all conditions, between the first and the last detector."""
+        """Largest difference over all conditions between the first and the last detector."""
         rows = zip(self.sweeps[0].awareness.rows, self.sweeps[-1].awareness.rows, strict=True)
         return max(abs(a.awareness.value - b.awareness.value) for a, b in rows)
 
 
 def _made(name: str, key: object, make: Callable[[], Tables]) -> Tables:
-    """Keep nothing."""
+    """Compute the result without a cache."""
     return make()
 
 
@@ -236,35 +237,35 @@ def degradation_study(
     keep: Keep = _made,
     fingerprint: Callable[[Path], str] = str,
 ) -> DegradationStudy:
-    """Stage blur, darkness, noise and rain, four levels each, and say what vision and the filter still hold.
+    """Stage blur, darkness, noise and rain at four levels each, and measure vision and hazard awareness.
 
-    Neither camera nor filter is given what is staged: d is read from the images, and beta from a table that
-    was measured on the recordings of other folds with the same detector. Thresholds are gamma(alpha) on the
-    hazard-free recordings of other folds.
+    Neither camera nor filter receives the staged degradation: d is estimated from the images, and beta comes
+    from a table measured on recordings of other folds with the same detector. Thresholds are gamma(alpha) on
+    the hazard-free recordings of other folds.
 
     Parameters
     ----------
     recordings : sequence of Recording
-        Those with video and detections and a standing ego are chosen from, evenly over the junctions.
+        Candidates; recordings with video, detections and a standing ego are chosen evenly over the junctions.
     settings : DegradationSettings, optional
-        What is swept.
+        Options of the sweep.
     over : callable
-        Does the work on every recording, in order. What it gives as text says why a recording failed,
-        which is then skipped.
+        Applies a function to every recording, in order. A text result describes why a recording failed; the
+        recording is then skipped.
     keep : callable
-        Keeps what a pass gave, such as `PassCache.tables`.
+        Caches the result of a pass, such as `PassCache.tables`.
     fingerprint : callable
-        Names the content of a recording's folder, for `keep`.
+        Returns a fingerprint of the content of a recording's folder, for `keep`.
 
     Returns
     -------
     DegradationStudy
-        Curves of beta, a row for each condition, and what rain takes beside its two effects alone.
+        Curves of beta, one row per condition, and the loss in rain compared with its two effects alone.
 
     Raises
     ------
     InvalidArgumentError
-        If there are fewer than two filmed approaches or hazard-free recordings.
+        If there are fewer than two approaches or hazard-free recordings with video.
     OutOfDomainError
         If the model was made for another array or rate.
 
@@ -292,12 +293,12 @@ def degradation_study(
     rates = {fold: passes.rates(folds != fold, seen, counts) for fold in set(folds.tolist())}
     items = [replace(one, rates=rates[fold]) for one, fold in zip(seen, folds.tolist(), strict=True)]
     believed = _done(over, passes.filter, items, skipped)
-    # By kind alone: a junction and side has one recording or two, which would hardly vary.
+    # Strata by kind only: each junction and side has one or two recordings, which would hardly vary.
     draws = stratified_draws([one.hazard_free for one in believed], rng)
     policy = read_model(chosen.model).policies.policies[0]
     left = {str(one) for one in believed}
     counts = [one for one, its in zip(counts, seen, strict=True) if str(its) in left]
-    # The same folds for every detector: what differs between them is no draw of the folds.
+    # The same folds for every detector, so that differences between detectors do not come from the folds.
     fold_seed = int(rng.integers(2**32))
 
     def sweep(name: str) -> DetectorSweep:
@@ -313,18 +314,18 @@ def degradation_study(
 
 @dataclass(frozen=True, slots=True)
 class SweepItem:
-    """One recording on its way through the passes; its text is its name."""
+    """One recording with the results of the passes so far; as text, its name."""
 
     recording: Recording
-    tables: Tables = field(default_factory=dict)  # What the pass before gave
-    rates: Mapping[str, MissRates] = field(default_factory=dict)  # By detector, of other recordings
+    tables: Tables = field(default_factory=dict)  # Result of the previous pass
+    rates: Mapping[str, MissRates] = field(default_factory=dict)  # By detector, measured on other recordings
 
     def __str__(self) -> str:
         return self.recording.recording_id
 
     @property
     def hazard_free(self) -> bool:
-        """Whether nothing approaches."""
+        """Whether the recording contains no approach."""
         return self.recording.label == "none"
 
 
@@ -338,11 +339,11 @@ class _Passes:
 
     @property
     def names(self) -> list[str]:
-        """Of the detectors."""
+        """Names of the detectors."""
         return [one.name for one in self.settings.detectors]
 
     def look(self, item: SweepItem) -> Tables:
-        """Return what every detector reported in every condition of the camera, and what it missed."""
+        """Return the detections and the misses of every detector in every condition of the camera."""
         recording = item.recording
 
         def make() -> Tables:
@@ -357,7 +358,7 @@ class _Passes:
         return self.keep("degraded-looks", self._look_key(item), make)
 
     def filter(self, item: SweepItem) -> Tables:
-        """Return what the filter believed in every condition, a table a detector."""
+        """Return the beliefs of the filter in every condition, one table per detector."""
         recording, model = item.recording, read_model(self.settings.model)
         rates = {name: one.to_dict() for name, one in item.rates.items()}
         key = [
@@ -398,14 +399,14 @@ class _Passes:
         return [conditions.VERSION, self.fingerprints[str(item)], self.names, chosen.width_px, chosen.seed]
 
     def _seed(self, item: SweepItem) -> tuple[int, int]:
-        """No recording's noise depends on which others there are."""
+        """Return a seed by which a recording's noise is independent of the other recordings."""
         return self.settings.seed, zlib.crc32(str(item).encode())
 
 
 def _done(
     over: Over, work: Callable[[SweepItem], Tables], items: Sequence[SweepItem], skipped: dict[str, str]
 ) -> list[SweepItem]:
-    """Do a pass; return the items with what it gave, and write down those that failed."""
+    """Run a pass; return the items with its results, and record those that failed."""
     done = []
     for item, tables in zip(items, over(work, items), strict=True):
         if isinstance(tables, str):

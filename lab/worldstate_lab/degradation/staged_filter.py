@@ -1,8 +1,8 @@
-"""Filter recordings and streams in staged states: sound dry and in the rain, camera as it was seen.
+"""Filter results on recordings and streams in staged states: dry or rainy sound, clean or degraded camera.
 
-A sweep over images needs filmed recordings, and an hour of them takes hours. On a stream the boxes of the
-camera are staged instead: each is left out as often as the table of miss rates says of the degradation, which
-the camera states.
+A sweep over images needs recordings with video, and processing an hour of them takes hours. On a stream, the
+boxes of the camera are degraded instead: each is removed with the probability in the table of miss rates for
+the degradation, which the camera reports.
 """
 
 import math
@@ -56,21 +56,21 @@ from .conditions import (
     rained,
 )
 
-# Changes whenever the same sound and looks would give other beliefs.
+# Increased whenever the same sound and looks would give different beliefs.
 VERSION = 7
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """One detector behind the camera of one recording."""
+    """One detector on the camera of one recording."""
 
     detector: StagedDetector
-    rates: MissRates  # Of this detector, measured on other recordings
-    boxes: HopTable  # What it reported; see `looks.look`
+    rates: MissRates  # Measured for this detector on other recordings
+    boxes: HopTable  # Its detections; see `conditions.look`
     readings: HopTable  # Quality of the images
 
     def look(self, source: Source, images: str, d: DegradationLog) -> VisionQuery:
-        """Return the channel that is asked in a condition of the camera."""
+        """Return the channel to be queried in a condition of the camera."""
         return VisionQuery(
             source.camera,
             detections_in(self.boxes, images),
@@ -85,7 +85,7 @@ class Camera:
 def cameras(
     detectors: Iterable[StagedDetector], rates: Mapping[str, MissRates], looks: Mapping[str, HopTable]
 ) -> list[Camera]:
-    """Return every detector with what it reported of one recording."""
+    """Return every detector with its detections in one recording."""
     return [Camera(one, rates[one.name], looks[one.name], looks[READINGS]) for one in detectors]
 
 
@@ -95,11 +95,12 @@ def filter_in_conditions(
     seed: Sequence[int],
     conditions: Sequence[Condition] = all_conditions(),
 ) -> dict[str, HopTable]:
-    """Return what the filter made of one recording with each detector, all conditions end to end.
+    """Return the filter's results on one recording with each detector, all conditions concatenated.
 
-    Columns are those of a hop stream and `condition`; `degradation`, d as it was estimated; `presence`, the
-    chance that a vehicle is there, hidden or visible, by the entities that the filter publishes; and `found`,
-    whether a moving object that is in view was detected, where `seen` takes any detection.
+    Columns are those of a hop stream and four more. `condition` is the name. `degradation` is the estimated
+    d. `presence` is the probability of a hidden or visible vehicle, from the entities that the filter
+    publishes. `found` is true if a moving object in view was detected, whereas `seen` is true for any
+    detection.
     """
     rms = level_rms(source)
     with one_blas_thread():
@@ -115,14 +116,15 @@ def filter_in_conditions(
 
 
 def _heard(source: Source, level: int, dry_rms: float, seed: int | Sequence[int]) -> list[Measurement]:
-    """Return the measurements of a recording or stream at a level of the rain on the roof."""
-    # The same drops at every level, only louder: what differs between levels is no draw of the noise.
+    """Return the measurements of a recording or stream at a level of rain on the roof."""
+    # The same noise at every level, only louder, so that differences between levels do not come from the
+    # noise.
     wet = rained(source, level, dry_rms, np.random.default_rng(seed)) if level else source
     return [measured for _, measured in measure_steps(wet)]
 
 
 def by_condition(filtered: HopTable) -> dict[str, HopTable]:
-    """Take the conditions apart that `filter_in_conditions` put end to end."""
+    """Split the concatenated conditions of `filter_in_conditions`."""
     names = filtered.columns["condition"]
     first = np.sort(np.unique(names, return_index=True)[1])
     parts = {
@@ -158,14 +160,14 @@ def _filtered(
 
 
 def _reference(source: Source, stamps_ns: Sequence[int]) -> list[FloatArray]:
-    """Return the moving boxes that are there at each stamp."""
+    """Return the moving reference boxes at each stamp."""
     if source.detections is None:
         return [np.empty((0, 4))] * len(stamps_ns)
     return _moving_boxes(source.detections, stamps_ns, DetectionFilter())
 
 
 def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFilter) -> list[FloatArray]:
-    """Return the moving boxes that count, shape (boxes, 4), of the frame at each stamp."""
+    """Return the accepted moving boxes, shape (boxes, 4), of the frame at each stamp."""
     longest_ns, found = nanoseconds(MAX_IMAGE_AGE_S), []
     for number in (log.latest(stamp_ns, longest_ns) for stamp_ns in stamps_ns):
         boxes_px = np.empty((0, 4))
@@ -177,7 +179,7 @@ def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFi
 
 
 def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Sequence[int]) -> BoolArray:
-    """Whether a moving box of the reference was found again at each stamp, as a miss rate counts it."""
+    """Return whether a moving reference box was detected at each stamp, counted as for a miss rate."""
     detected = _moving_boxes(query.detections, stamps_ns, query.keep) if query.detections else []
     found = [
         (overlaps(there, boxes) >= MIN_OVERLAP).any()
@@ -187,10 +189,10 @@ def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Seque
 
 
 def _presence(source: Source, measurements: Sequence[Measurement]) -> list[float]:
-    r"""Return the chance that a vehicle is there at every hop, :math:`1 - \prod_i (1 - r_i)`.
+    r"""Return the probability of any vehicle at every hop, :math:`1 - \prod_i (1 - r_i)`.
 
-    Of the entities, not of the explanations: what the camera has shown, or the sequence has told, stays in
-    them while the window at hand tells nothing.
+    It uses the entities and not the explanations: entities keep the evidence of the camera and of the
+    sequence while the current window is uninformative.
     """
     world, presence = WorldFilter(context=source.context, policy=source.policy), []
     for measurement in measurements:
@@ -200,9 +202,10 @@ def _presence(source: Source, measurements: Sequence[Measurement]) -> list[float
     return presence
 
 
-# Changes whenever the same stream would give other advisories.
+# Increased whenever the same stream would give different advisories.
 STREAM_VERSION = 3
-# Half of the way and all of it for the camera; of the rain the heaviest, as each level is heard anew.
+# Half and full degradation for the camera; only the heaviest rain, because each level needs a pass over the
+# sound.
 STATES = (
     Condition(CLEAN),
     Condition(LENS, 2),
@@ -211,19 +214,19 @@ STATES = (
     Condition(ROOF, 4),
     Condition(RAIN, 4),
 )
-# Onsets come in bursts: minutes are drawn, not onsets.
+# Onsets come in bursts, so minutes are resampled and not onsets.
 _PIECE_HOPS = round(60.0 / HOP_S)
 
 
 @dataclass(frozen=True, slots=True)
 class FalseAdvisories:
-    """One state of camera and roof beside the clean one, on the same hours."""
+    """One state of camera and rain compared with the clean one, on the same hours."""
 
     name: str
     onsets: int
     per_hour: Estimate  # With the exact interval
-    upper_90: float  # What the rate does not exceed with a confidence of .9
-    ratio: Estimate  # To the clean camera, over draws of minutes, the same for both
+    upper_90: float  # Upper bound of the rate at a confidence of 0.9
+    ratio: Estimate  # Relative to the clean camera, over draws of minutes, the same for both
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,19 +238,19 @@ class StreamSweep:
 
 
 def states_told() -> list[str]:
-    """Return all that the advisories depend on beside the stream, the model and the seed."""
+    """Return the settings that the advisories depend on, besides stream, model and seed."""
     return [*(state.name for state in STATES), *map(repr, RAIN_DB), repr(default_miss_rates())]
 
 
 def staged_advisories(path: Path, model: Path | None, seed: int) -> HopTable:
-    """Return the advisories of a stream in every state end to end: `condition`, `time_s`, `advised`."""
+    """Return the advisories of a stream in all states, concatenated: `condition`, `time_s`, `advised`."""
     source = open_source(path, model=read_model(model))
     with one_blas_thread():
         return joined(_advised(source, seed))
 
 
 def stream_sweep(streams: Iterable[HopTable], seed: int) -> StreamSweep:
-    """Count the onsets of every state, and hold them against those of the clean camera minute by minute."""
+    """Count the onsets of every state, and compare them with those of the clean camera minute by minute."""
     parts = [[one.advised[one.condition == state.name] for state in STATES] for one in streams]
     hours = sum(flags[0].size for flags in parts) * HOP_S / SECONDS_PER_HOUR
     onsets = np.concatenate([np.stack([_by_minute(one) for one in flags], axis=1) for flags in parts])
@@ -276,13 +279,13 @@ def _advised(source: Source, seed: int) -> Iterator[HopTable]:
     for state in STATES:
         level = state.sound_level
         if level not in heard:
-            # One level at a time: an hour of measurements takes half a gigabyte.
+            # One level at a time: the measurements of an hour need half a gigabyte.
             heard = {level: _heard(source, level, rms, seed)}
         yield _followed(source, heard[level], state, seed)
 
 
 def _followed(source: Source, measured: Sequence[Measurement], state: Condition, seed: int) -> HopTable:
-    """Return at every hop whether the world-state warns in a state, of either side."""
+    """Return whether an advisory is on in a state, on either side, at every hop."""
     world, query, advised = source.world(), _query(source, state, seed), []
     for one in measured:
         world = world.predict_to(one.stamp_ns).update(asked_again(one, query))
@@ -294,11 +297,11 @@ def _followed(source: Source, measured: Sequence[Measurement], state: Condition,
 
 
 def _query(source: Source, state: Condition, seed: int) -> VisionQuery | None:
-    """Return the camera of a state, which knows how degraded it is; None for none."""
+    """Return the camera of a state, which reports its degradation; None for no camera."""
     if state.family == OFF or source.detections is None:
         return None
     table, degradation = default_miss_rates(), state.degradation if state.family in (LENS, RAIN) else 0.0
-    # The same luck in every state: what is missed with a better camera is missed with a worse one.
+    # The same random numbers in every state: an object that a better camera misses, a worse one misses too.
     rng = np.random.default_rng(seed)
     return VisionQuery(
         source.camera,
@@ -317,7 +320,7 @@ def missed(
     degradation: float,
     rng: np.random.Generator,
 ) -> DetectionLog:
-    r"""Return a log without the boxes that a camera degraded by d would have missed as well.
+    r"""Return a log without the boxes that a camera with degradation d would also have missed.
 
     .. math:: P(missed \mid reported) = \frac{\beta(\theta, d) - \beta(\theta, 0)}{1 - \beta(\theta, 0)}
     """
@@ -331,7 +334,7 @@ def missed(
         )
         before, after = table.over(azimuths), table.over(azimuths, degradation)
         left = 1.0 - before
-        # Beyond the table nothing is seen, and nothing more can be missed.
+        # Outside the table nothing is detected, so nothing more can be missed.
         share = np.divide(after - before, left, out=np.zeros_like(left), where=left > 0.0)
         kept = np.flatnonzero(rng.random(len(azimuths)) >= share).tolist()
         frames.append(

@@ -1,1 +1,1 @@
-"""Figures of merit that only studies use: GOSPA, track measures, bootstrap draws, folds."""
+"""Figures of merit for studies: GOSPA, track measures, bootstrap draws, folds."""

@@ -1,15 +1,15 @@
-"""Intervals of figures: recordings dealt to folds, drawn again and again, and counted as often as drawn.
+"""Intervals of figures: recordings are assigned to folds, resampled, and weighted by their number of draws.
 
 Recordings are drawn with replacement, by stratum; `stratified_draws([0] * n, rng)` draws minutes or passes of
-one kind. A figure is formed on every draw, by its rows or by `draw_weights`, and `middle` is its interval:
+one kind. A figure is computed on every draw, by its rows or by `draw_weights`, and `middle` is its interval:
 
 >>> values = np.array([0.4, 0.9, 0.7, 0.8])
 >>> drawn = values[stratified_draws([0] * 4, np.random.default_rng(0), draws=1000)].mean(axis=1)
 >>> [round(end, 2) for end in middle(drawn)]
 [0.53, 0.85]
 
-Figures by group, such as a junction, have their mean and the worst of them. Exact intervals of counts and
-shares are in `worldstate.operations.metrics.approach_table`.
+Figures by group, such as a junction, are summarised by their mean and the worst of them. Exact intervals of
+counts and shares are in `worldstate.operations.metrics.approach_table`.
 """
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc, poisson_interval
 from worldstate.operations.training.training import recording_labels
 
-# Twelve draws lie beyond each end of the interval.
+# Twelve draws are outside each end of the interval.
 DRAWS = 500
 _TAIL = (1.0 - 0.95) / 2.0
 
@@ -40,7 +40,7 @@ Part = TypeVar("Part", IndexArray, FloatArray)
 def stratified_draws(strata: Sequence[Hashable], rng: np.random.Generator, draws: int = DRAWS) -> IndexArray:
     """Draw recordings with replacement, as many of each stratum as there are, shape (draws, n).
 
-    Place i of every draw holds a recording of the stratum of recording i.
+    Element i of every draw is a recording of the stratum of recording i.
 
     Examples
     --------
@@ -52,7 +52,7 @@ def stratified_draws(strata: Sequence[Hashable], rng: np.random.Generator, draws
     for i, stratum in enumerate(strata):
         members.setdefault(stratum, []).append(i)
     drawn = np.empty((draws, len(strata)), dtype=np.intp)
-    # A stratum of one recording is in every draw: its own spread cannot be known.
+    # A stratum of one recording is in every draw: its spread cannot be estimated.
     for rows in map(np.array, members.values()):
         drawn[:, rows] = rng.choice(rows, (draws, rows.size))
     return drawn
@@ -61,7 +61,7 @@ def stratified_draws(strata: Sequence[Hashable], rng: np.random.Generator, draws
 def pooled_draws(
     parts: Sequence[Part], strata: Sequence[Hashable], rng: np.random.Generator, draws: int = DRAWS
 ) -> Iterator[Part]:
-    """Yield what recordings hold together in each draw of them: their rows, or their values.
+    """Yield the concatenated rows or values of the recordings in each draw.
 
     Examples
     --------
@@ -74,14 +74,14 @@ def pooled_draws(
 
 
 def middle(values: FloatArray) -> Interval:
-    """Return the middle 95 % of the draws, NaN where there are none.
+    """Return the central 95 % of the draws, NaN if there are none.
 
     Examples
     --------
     >>> [round(end, 6) for end in middle(np.array([np.nan, *range(41)]))]
     [1.0, 39.0]
     """
-    # A figure that a draw does not have, such as a bearing without anything in view, is left out of it.
+    # Draws without the figure, such as a bearing error without a vehicle in view, are ignored.
     known = values[~np.isnan(values)]
     if not known.size:
         return float("nan"), float("nan")
@@ -90,7 +90,7 @@ def middle(values: FloatArray) -> Interval:
 
 
 def paired_gains(ours: Mapping[str, FloatArray], other: Mapping[str, FloatArray]) -> dict[str, Interval]:
-    """Return the middle 95 % of the difference of every figure to another method on the same draws.
+    """Return the central 95 % of each figure's difference to another method on the same draws.
 
     Examples
     --------
@@ -98,7 +98,7 @@ def paired_gains(ours: Mapping[str, FloatArray], other: Mapping[str, FloatArray]
     >>> paired_gains(ours, {"tpr": ours["tpr"] - 2.0})
     {'tpr': (2.0, 2.0)}
     """
-    # Both methods stumble over the same hard recordings: paired, those cancel.
+    # Both methods fail on the same hard recordings; in paired differences these errors cancel.
     return {figure: middle(values - other[figure]) for figure, values in ours.items()}
 
 
@@ -111,14 +111,14 @@ def recording_draws(table: FeatureTable, rng: np.random.Generator, draws: int = 
 
 
 def poisson_upper(count: int, exposure: float) -> float:
-    """Return the rate that is not exceeded with a confidence of .9: the one-sided exact bound.
+    """Return the one-sided exact upper bound of a rate at a confidence of 0.9.
 
     Examples
     --------
     >>> round(poisson_upper(0, exposure=1.0), 2)
     2.3
     """
-    # The upper end of a two-sided interval leaves as much beyond it on either side.
+    # A two-sided interval has equal probabilities outside its two ends.
     return poisson_interval(count, exposure, 2.0 * 0.9 - 1.0)[1]
 
 
@@ -129,8 +129,8 @@ def random_detection(
 
     .. math:: \sum_i t_i \left(1 - (1 - w_i / T)^N\right) / \sum_i t_i
 
-    `windows_s` (n,) holds w, the time before each T0 in which an onset counts; T is all scored time. On
-    samples of the approaches, which hold each of them `times` (D, n), `alarms` and `scored_s` are (D,).
+    `windows_s` (n,) is w, the time before each T0 in which an onset counts; T is all scored time. For samples
+    of the approaches that contain each of them `times` (D, n), `alarms` and `scored_s` have shape (D,).
 
     Examples
     --------
@@ -161,7 +161,7 @@ def draw_weights(draws: IndexArray, recordings: int) -> FloatArray:
 
 
 def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
-    """Return the quotient, NaN where there is nothing to divide by.
+    """Return the quotient, NaN if the denominator is zero.
 
     Examples
     --------
@@ -173,20 +173,20 @@ def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
 
 
 def known_mean(values: FloatArray) -> FloatArray:
-    """Return the mean over the first axis of what is not NaN.
+    """Return the mean over the first axis, without NaN.
 
     Examples
     --------
     >>> known_mean(np.array([[1.0, np.nan], [3.0, np.nan]]))
     array([ 2., nan])
     """
-    # `nanmean` warns where a column is all NaN, which here is an answer like any other.
+    # `nanmean` warns if a column is all NaN, which is a valid input here.
     known = np.isfinite(values)
     return ratio(np.where(known, values, 0.0).sum(axis=0), known.sum(axis=0))
 
 
 def weighted_median(values: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the median of values (n,) that count times[d, i] times, NaN where none does, shape (D,).
+    """Return the median of values (n,) with weights times[d, i], NaN if all are zero, shape (D,).
 
     Examples
     --------
@@ -198,14 +198,14 @@ def weighted_median(values: FloatArray, times: FloatArray) -> FloatArray:
     order = np.argsort(values)
     kept = np.cumsum(times[:, order], axis=1)
     half = kept[:, -1:] / 2.0
-    # Of an even number the mean of the two in the middle, as numpy's median of the repeated values.
+    # For an even number, the mean of the two central values, like numpy's median of the repeated values.
     low, high = np.argmax(kept >= half, axis=1), np.argmax(kept > half, axis=1)
     median = (values[order][low] + values[order][high]) / 2.0
     return np.where(half[:, 0] > 0.0, median, np.nan)
 
 
 def highest_share(values: FloatArray, times: FloatArray, share: float) -> BoolArray:
-    """Return which values stand at or above the highest threshold that keeps a share of them, shape (D, n).
+    """Return a mask of the values at or above the highest threshold that keeps a share, shape (D, n).
 
     Examples
     --------
@@ -216,7 +216,7 @@ def highest_share(values: FloatArray, times: FloatArray, share: float) -> BoolAr
         return np.zeros(times.shape, bool)
     order = np.argsort(-values, kind="stable")
     kept = np.cumsum(times[:, order], axis=1)
-    # Equal values are kept together; sums of whole numbers are exact, the product with the share is not.
+    # Equal values are kept together. Sums of whole numbers are exact, but the product with the share is not.
     last = np.argmax(kept >= share * kept[:, -1:] - 1e-9, axis=1)
     return np.asarray(values >= values[order][last][:, None])
 
@@ -224,7 +224,7 @@ def highest_share(values: FloatArray, times: FloatArray, share: float) -> BoolAr
 def deal_folds(
     labels: Sequence[str], groups: Sequence[str], rng: np.random.Generator, folds: int = FOLDS
 ) -> IndexArray:
-    """Deal recordings to folds so that each holds its share of every label in every group, shape (n,).
+    """Assign recordings to folds so that each has its share of every label in every group, shape (n,).
 
     There are never more folds than recordings of the rarer kind, hazard-free or approach.
 
@@ -244,19 +244,19 @@ def deal_folds(
     keys = [(~free[i], labels[i], groups[i], rng.random()) for i in range(len(labels))]
     order = sorted(range(len(labels)), key=keys.__getitem__)
     fold_of = np.empty(len(labels), dtype=np.intp)
-    # Dealing goes on where the last stratum stopped, or the first folds would collect every remainder.
+    # Assignment continues where the last stratum ended; otherwise the first folds would get every remainder.
     fold_of[order] = np.arange(len(labels)) % min(*counts, folds)
     return fold_of
 
 
-# The mean is then known to a twentieth of its standard deviation between draws.
+# The standard error of the mean is then a twentieth of the standard deviation between draws.
 _FLOOR_DRAWS = 400
 
 
 def calibration_error_sampling(
     risk: ArrayLike, rng: np.random.Generator, draws: int = _FLOOR_DRAWS
 ) -> tuple[float, float]:
-    r"""Return mean and standard deviation of the ECE that labels drawn from these very risks would score.
+    r"""Return mean and standard deviation of the ECE for labels drawn from the given risks.
 
     The mean is the sampling floor at this number of windows.
 
@@ -284,7 +284,7 @@ def calibration_error_sampling(
 
 
 def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:
-    """Return the area of each group that has both labels, in the order of their names.
+    """Return the area of each group that has both labels, sorted by name.
 
     Shapes: scores, positive (n,), groups (n,).
 
@@ -312,7 +312,7 @@ def macro(by_group: Mapping[str, float]) -> float:
 
 
 def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> float:
-    r"""Return the share of hazard-free windows that are in alarm at the junction where it is largest.
+    r"""Return the share of hazard-free windows in alarm at the junction where it is largest.
 
     .. math:: \max_s \frac{\sum_i a_i f_i [s_i = s]}{\sum_i f_i [s_i = s]}
 
@@ -328,14 +328,14 @@ def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> fl
 
 
 def worst_group(values: Mapping[str, float], worse: Literal["low", "high"]) -> tuple[str, float]:
-    """Return name and figure of the worst group, the first of equals; ("", NaN) where none has a figure.
+    """Return name and figure of the worst group, the first of equals; ("", NaN) if no group has a figure.
 
     Examples
     --------
     >>> worst_group({"SA1": 0.9, "SB1": 0.6, "SC1": float("nan")}, worse="low")
     ('SB1', 0.6)
     """
-    # NaN compares as neither less nor greater, so that min and max would depend on the order.
+    # Comparisons with NaN are false, so the result of min and max would depend on the order.
     known = {name: value for name, value in values.items() if not np.isnan(value)}
     if not known:
         return "", float("nan")

@@ -1,4 +1,4 @@
-"""The hazard statistic over a recorded stream, with the parts of it that an ablation removes as switches."""
+"""The hazard statistic over a recorded stream, with switches for the parts that an ablation removes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,18 +9,18 @@ from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_table import ABSENT, PRESENT, HopTable
 
-# An approach score beyond this many standard deviations says no more than one at it.
+# An approach score above this many standard deviations is treated as equal to it.
 LARGEST_SCORE = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class StatisticSwitches:
-    """What of eq. (6) the statistic uses."""
+    """Parts of eq. (6) that the statistic uses."""
 
-    # False drops the answer of the channel that was asked: the signature alone, beta = 1.
+    # False ignores the result of the camera query: only the signature is used, beta = 1.
     use_absence: bool = True
-    # Nats by which the log-odds rise with each standard deviation of the approach rate above zero; where it
-    # is not usable it is marginalised.
+    # Increase of the log-odds, in nats, per standard deviation of the approach rate above zero. Hops without
+    # a usable rate are marginalised.
     approach_weight: float = 0.0
 
     def __post_init__(self) -> None:
@@ -36,7 +36,7 @@ def stream_statistic(
               {\pi_{vis}\, p(V | vis)\, \ell_{vis} / p(V | hid) + \pi_0\, \ell_0}
               + w\, \frac{\rho}{\sigma_\rho}
 
-    with the approach rate rho in standard deviations, held within three. Without the last term it is
+    with the approach rate rho in standard deviations, clipped to three. Without the last term it is
     `abduction.posterior.statistic`.
 
     Shapes: reference_prior (K + 2,).
@@ -51,13 +51,13 @@ def stream_statistic(
 
 
 def approach_score(stream: HopTable) -> FloatArray:
-    """Return the approach rate in standard deviations within three, 0 where it is not usable, shape (n,)."""
+    """Return the approach rate in standard deviations, clipped to three, 0 if not usable, shape (n,)."""
     usable = np.isfinite(stream.approach)
     return np.where(usable, np.clip(stream.approach, -LARGEST_SCORE, LARGEST_SCORE), 0.0)
 
 
 def log_joint(stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches) -> FloatArray:
-    """Log of prior, signature and answer, up to a constant of each hop, shape (n, K + 2)."""
+    """Return the log of prior, signature and query result, up to a constant per hop, shape (n, K + 2)."""
     prior = finite_array("reference_prior", reference_prior, (stream.log_likelihoods.shape[1],))
     joint = np.log(prior) + stream.log_likelihoods
     with np.errstate(divide="ignore"):
@@ -66,11 +66,11 @@ def log_joint(stream: HopTable, reference_prior: Sequence[float], switches: Stat
 
 
 def _log_visible(stream: HopTable, switches: StatisticSwitches) -> FloatArray:
-    """Log p(V | visible) / p(V | hidden or none) at every hop."""
+    """Return log p(V | visible) / p(V | hidden or none) at every hop."""
     if not switches.use_absence:
         return np.zeros(len(stream))
     beta, answer = stream.miss_rate, stream.answer
-    # Where nothing is present the clutter does not matter, and 1 keeps its logarithm finite.
+    # If nothing is present the clutter does not matter, and 1 keeps its logarithm finite.
     clutter = np.where(answer == PRESENT, stream.clutter_rate, 1.0)
     present = np.log1p(-beta * (1.0 - clutter)) - np.log(clutter)
     return np.select([answer == ABSENT, answer == PRESENT], [np.log(beta), present], 0.0)

@@ -4,7 +4,7 @@ C. Evers et al., "The LOCATA challenge: acoustic source localization and trackin
 K. Bernardin and R. Stiefelhagen, "Evaluating multiple object tracking performance: the CLEAR MOT metrics",
 EURASIP Journal on Image and Video Processing, 2008.
 
-Prominence gating: the accuracy of bearings that a camera could check against the share that is kept.
+Prominence gating gives the accuracy of bearings with a camera reference as a function of the share kept.
 """
 
 import math
@@ -20,16 +20,16 @@ from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, IntArray
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.operations.recordings.hop_table import HopTable
 
-# The paper's second point: 2.4 degrees at 16 % coverage, after 3.4 degrees on all.
+# The paper's points: 3.4 degrees for all bearings, 2.4 degrees at 16 % coverage.
 PUBLISHED = ((1.0, 3.4), (0.16, 2.4))
 PUBLISHED_COVERAGE = PUBLISHED[1][0]
-# Thresholds of a curve, evenly spread over the coverage.
+# Maximum number of thresholds of a curve, evenly spaced in coverage.
 _MOST_POINTS = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GatingCurve:
-    r"""Coverage and median error of bearings over the threshold on their prominence.
+    r"""Coverage and median error of bearings as functions of a threshold on their prominence.
 
     .. math:: c(\rho_0) = \frac{\#\{i : \rho_i \ge \rho_0\}}{n}, \qquad
               e(\rho_0) = \mathrm{median}\{|\epsilon_i| : \rho_i \ge \rho_0\}
@@ -100,12 +100,12 @@ def gating_curve(prominence: ArrayLike, error_rad: ArrayLike) -> GatingCurve:
     Returns
     -------
     GatingCurve
-        One point for every prominence that occurs, or an even choice of them; the first keeps all.
+        One point for each occurring prominence, or an evenly spaced choice; the first keeps all.
 
     Raises
     ------
     InvalidArgumentError
-        On another shape, no bearings, NaN or infinity.
+        If a shape is wrong, there are no bearings, or a value is not finite.
 
     References
     ----------
@@ -135,7 +135,7 @@ def gating_curve(prominence: ArrayLike, error_rad: ArrayLike) -> GatingCurve:
 
 
 def bearing_curve(checks: HopTable) -> GatingCurve | NotUsable:
-    """Trade coverage for accuracy, by the bearings that a moving box could check."""
+    """Return the gating curve of the bearings that have a moving box as reference."""
     seen = np.isfinite(checks.error_rad)
     if not seen.any():
         return NotUsable("no bearing with a moving box in view")
@@ -143,19 +143,20 @@ def bearing_curve(checks: HopTable) -> GatingCurve | NotUsable:
 
 
 def gated_median_deg(checks: HopTable) -> float:
-    """Return the median error of the most prominent 16 %; NaN where no bearing could be checked."""
+    """Return the median error of the most prominent 16 %; NaN if no bearing has a reference."""
     curve = bearing_curve(checks)
     return np.nan if isinstance(curve, NotUsable) else np.degrees(curve.at_coverage(PUBLISHED_COVERAGE)[1])
 
 
-# A miss costs half of it. At the 20 degrees that bearing trackers are often scored at, silence (10) beats
-# every estimate that is 10 degrees off or more; at 60 it costs as much as the gate of the track measures.
+# A miss costs half of it. At 20 degrees, a common choice for bearing trackers, no output (10) scores better
+# than any estimate with an error of 10 degrees or more. At 60, a miss costs as much as the gate of the track
+# measures.
 CUTOFF_RAD = math.radians(60.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gospa:
-    """GOSPA of one moment: total to the power p is the sum of its three parts.
+    """GOSPA at one instant: the total to the power p is the sum of its three parts.
 
     Examples
     --------
@@ -166,9 +167,9 @@ class Gospa:
 
     total_rad: float
     localisation: float  # Sum of the p-th powers of the errors of the pairs
-    missed: float  # Half a cut-off to the power p for each truth without an estimate
-    false: float  # And for each estimate without a truth
-    pairs: IndexArray  # shape (k, 2): Rows of estimate and truth that belong together
+    missed: float  # For each truth without an estimate, half of the cut-off to the power p
+    false: float  # The same for each estimate without a truth
+    pairs: IndexArray  # shape (k, 2): Rows of the matched estimate and truth
 
 
 def gospa_bearing(
@@ -186,7 +187,7 @@ def gospa_bearing(
     """
     # A. S. Rahmathullah, A. F. Garcia-Fernandez and L. Svensson, "Generalized optimal sub-pattern assignment
     # metric", FUSION 2017. With alpha = 2 a pair at the cut-off costs as much as one miss and one false
-    # target, so that the assignment may run over pairs only, each cut off there.
+    # target, so the assignment may use pairs only, each limited to the cut-off.
     estimates = finite_array("estimates_rad", estimates_rad, (None,))
     truths = finite_array("truths_rad", truths_rad, (None,))
     power = in_range("order", order, 1.0, math.inf)
@@ -201,18 +202,19 @@ def gospa_bearing(
     return Gospa(sum(parts) ** (1.0 / power), *parts, pairs)
 
 
-# The gate of the challenge.
+# The gate of the LOCATA challenge.
 GATE_RAD = math.radians(30.0)
-# Angles are at most pi: a match within the gate always beats a miss, and what CLEAR-MOT holds beats both.
+# Angles are at most pi: a match within the gate always costs less than a miss, and a match kept from the
+# previous hop (CLEAR-MOT) less than both.
 _MISS, _HOLD = 1e3, 1e6
-# Two tracks to one side of two sources cost the same either way round, and round-off would swap their names
-# at random: a touch of the squared error decides for the order of the sources.
+# Two tracks on the same side of two sources cost the same in both assignments, and round-off would swap their
+# identities at random: a small part of the squared error decides by the order of the sources.
 _TIE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackRows:
-    """Estimates, one row a hop and track.
+    """Estimates, one row per hop and track.
 
     Examples
     --------
@@ -231,7 +233,7 @@ class TrackRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthRows:
-    """Sources, one row a hop and source.
+    """Sources, one row per hop and source.
 
     Examples
     --------
@@ -242,7 +244,7 @@ class TruthRows:
     hop: IntArray  # shape (n,): Number of the hop
     source: IntArray  # shape (n,): Identity
     azimuth_rad: FloatArray  # shape (n,)
-    active: BoolArray  # shape (n,): Whether a track is asked for
+    active: BoolArray  # shape (n,): Whether a track is expected
 
     def __post_init__(self) -> None:
         finite_array("azimuth_rad", self.azimuth_rad, (len(self.hop),))
@@ -252,7 +254,7 @@ class TruthRows:
 
 @dataclass(frozen=True, slots=True)
 class TrackMeasures:
-    """Means over active periods (runs of hops in which one source is active); NaN where nothing is active.
+    """Means over active periods (runs of hops in which one source is active); NaN without an active source.
 
     Examples
     --------
@@ -264,14 +266,14 @@ class TrackMeasures:
     (0.3, 0.7, 0.0, 0.1)
     """
 
-    latency_s: float  # From the begin of a period to its first track; all of it where there is none
-    swap_rate_hz: float  # Changes of the track of a source
-    fragmentation_rate_hz: float  # These, and returns of a track that was lost within the period
+    latency_s: float  # From the start of a period to its first track; the whole period if there is none
+    swap_rate_hz: float  # Changes of the track that a source has
+    fragmentation_rate_hz: float  # Swaps, and returns of a track that was lost within the period
     azimuth_error_rad: float  # Mean absolute error within the gate
     detection: float  # Share of the hops of a period with a track
-    identity_switches: int  # CLEAR-MOT: what was matched stays matched while it lies within the gate
+    identity_switches: int  # CLEAR-MOT: a match is kept while it is within the gate
     fragmentations: int
-    active_s: float  # Length of all periods together
+    active_s: float  # Total length of all periods
 
 
 _NOTHING_ACTIVE = TrackMeasures(math.nan, math.nan, math.nan, math.nan, math.nan, 0, 0, 0.0)
@@ -313,45 +315,46 @@ def track_measures(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matched:
-    """The active rows by source and hop, each with the track that it is matched to."""
+    """The active rows by source and hop, each with its matched track."""
 
     source: IntArray
     period: IndexArray  # Number of the active period
     place: IndexArray  # Within the period, in hops
     matched: BoolArray
-    track: IntArray  # Where matched
+    track: IntArray  # If matched
     error_rad: FloatArray
 
     def swaps(self) -> IndexArray:
-        """Return the rows at which a source has another track than when it was matched last."""
-        # As in the challenge and in CLEAR-MOT, misses and pauses between do not excuse a new name.
+        """Return the rows at which a source has another track than at its last match."""
+        # As in the challenge and in CLEAR-MOT, a new identity after misses or pauses counts as a swap.
         rows = np.flatnonzero(self.matched)
         changed: BoolArray = (np.diff(self.source[rows]) == 0) & (np.diff(self.track[rows]) != 0)
         return rows[1:][changed]
 
     def returns(self, stretch: IntArray | IndexArray) -> IndexArray:
-        """Return the rows at which a source is matched again after misses in the same stretch of rows."""
-        # The released code of the challenge also counts the first match after a late start; the article
-        # speaks of interrupted tracks, and a late start is in the latency already.
+        """Return the rows at which a source is matched again after misses in the same run of rows."""
+        # The released code of the challenge also counts the first match after a late start. The article
+        # defines only interrupted tracks, and a late start is already part of the latency.
         rows = np.flatnonzero(self.matched)
         resumed: BoolArray = (np.diff(rows) > 1) & (np.diff(stretch[rows]) == 0)
         return rows[1:][resumed]
 
     def latency_hops(self) -> IndexArray:
-        """Return the hops of each period before its first match, all of them where there is none."""
-        # Left out, or 0 as in the released code, a source that is never found would look quick.
+        """Return the hops of each period before its first match, or all of them if there is none."""
+        # If left out, or set to 0 as in the released code, a source that is never found would lower the
+        # latency.
         first = np.bincount(self.period)
         np.minimum.at(first, self.period[self.matched], self.place[self.matched])
         return first
 
     def azimuth_error_rad(self) -> float:
-        """Return the mean over periods of the mean error; periods without a match say nothing of it."""
+        """Return the mean over periods of the mean error; periods without a match are left out."""
         counts = np.bincount(self.period[self.matched])
         sums = np.bincount(self.period[self.matched], self.error_rad[self.matched])
         return float(np.mean(sums[counts > 0] / counts[counts > 0])) if counts.size else math.nan
 
     def rate(self, *events: IndexArray) -> float:
-        """Return events a hop, mean over periods."""
+        """Return the number of events per hop, mean over periods."""
         hops = np.bincount(self.period)
         happened = np.bincount(self.period[np.concatenate(events)], minlength=hops.size)
         return float(np.mean(happened / hops))
@@ -377,7 +380,7 @@ def _match(estimates: TrackRows, truths: TruthRows, gate: float, *, keep: bool) 
 def _match_hops(
     estimates: TrackRows, truths: TruthRows, gate: float, keep: bool
 ) -> tuple[IntArray, FloatArray]:
-    """Return track and error of every truth, NaN where it has none."""
+    """Return track and error of every truth, NaN if it has none."""
     track, error = np.zeros(truths.hop.size, np.int64), np.full(truths.hop.size, np.nan)
     there = _rows_by_hop(np.arange(estimates.hop.size), estimates.hop)
     active = _rows_by_hop(np.flatnonzero(truths.active), truths.hop)
@@ -385,7 +388,7 @@ def _match_hops(
     for hop in sorted(active.keys() & there.keys()):
         rows, said = active[hop], there[hop]
         sources, names = truths.source[rows].tolist(), estimates.track[said].tolist()
-        # Held is what was matched in the hop before, as in CLEAR-MOT; after a miss the nearest is taken.
+        # Matches of the previous hop are kept, as in CLEAR-MOT; after a miss the nearest track is taken.
         held = np.array([[(hop - 1, source, name) in last for name in names] for source in sources])
         cost = _bearing_errors(truths.azimuth_rad[rows], estimates.azimuth_rad[said])
         within = cost <= gate
@@ -400,7 +403,7 @@ def _match_hops(
 def _rows_by_hop(rows: IndexArray, hop: IntArray) -> dict[int, IndexArray]:
     rows = rows[np.argsort(hop[rows], kind="stable")]
     values, starts = np.unique(hop[rows], return_index=True)
-    # The piece before the first start is empty, and the only one where there are no rows.
+    # The piece before the first start is empty, and the only one if there are no rows.
     return dict(zip(values.tolist(), np.split(rows, starts)[1:], strict=True))
 
 

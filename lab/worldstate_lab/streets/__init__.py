@@ -1,1 +1,1 @@
-"""Simulated feature windows of junctions, and how far they are from real ones."""
+"""Simulated feature windows of junctions, and their distance to real ones."""

@@ -1,13 +1,14 @@
-r"""How far the columns that a sequence reads in simulated streams are from those of real recordings.
+r"""Distance between sequence inputs in simulated streams and in real recordings, by column.
 
-Streams are cut into excerpts as long as recordings, with T0 at the same time, and both are read alike: the
-approach comes from the left, levels are dB over the quietest fifth of the excerpt so far, as a sequence reads
-them. The distance of two junctions in a column is the energy distance,
+Streams are cut into excerpts as long as recordings, with T0 at the same time, and both are processed alike:
+the approach comes from the left, and levels are dB above the quietest fifth of the excerpt so far, as in the
+sequence model. The distance of two junctions in a column is the energy distance,
 
 .. math:: D^2 = \overline{|X - Y|} - \tfrac12 \overline{|X - X'|} - \tfrac12 \overline{|Y - Y'|},
 
-over the interquartile range of real recordings, in the mean over the statistics of the column. Means are over
-pairs of different excerpts, so that two draws of one street have zero in the mean, however few they are.
+divided by the interquartile range of real recordings and averaged over the statistics of the column. Means
+are over pairs of different excerpts, so that two samples of one street have an expected distance of zero for
+any sample size.
 
 References
 ----------
@@ -26,25 +27,26 @@ from worldstate.ground.typing import FloatArray
 from worldstate_lab.metrics.intervals import draw_weights, known_mean, middle, ratio, stratified_draws
 from worldstate_lab.report.table import Value
 
-# An approach rate and its deviation are left out: whether there is a rate depends on how much of the quiet
-# street was heard before, which is a second in a recording and minutes in a stream.
+# Approach rate and its deviation are left out: whether a rate exists depends on the duration of the quiet
+# sound before, which is a second in a recording and minutes in a stream.
 COMPARED = ("this", "other", *(name for name in COLUMNS[2:] if name not in ("rate", "spread")))
 _READ = [COLUMNS.index({"this": "left", "other": "right"}.get(name, name)) for name in COMPARED]
 _LEVELS = [i for i, name in enumerate(COMPARED) if name.startswith(("level", "loudness", "band"))]
 _BEARING = COMPARED.index("bearing")
 BEFORE_S, CHANGES_S, LAGS_S = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0), (1.0, 2.0, 3.0), (0.3, 1.0, 2.0)
-# Of a recording: when T0 is, how long it is, and from when on the quiet street is known a little.
+# T0 of a recording, its length, and the time from which the quiet level is roughly known.
 T0_S, LENGTH_S, KNOWN_S = 7.0, 10.0, 2.0
-_HOP_S, _APART_S = 0.1, 0.9  # Rows of a hazard-free excerpt are so far apart, as neighbours are alike
-_ALONE_S = 1.5  # After T0 no other vehicle comes into view so soon
+# Interval between rows of a hazard-free excerpt, because adjacent rows are similar
+_HOP_S, _APART_S = 0.1, 0.9
+_ALONE_S = 1.5  # Time after T0 without another vehicle
 DB = 10.0 / np.log(10.0)
 DRAWS = 200
-_LEAST = 1e-4  # Of a squared distance that is divided by: a hundredth of a spread is none
+_LEAST = 1e-4  # Lower bound of a squared distance in a denominator: a hundredth of the spread is negligible
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excerpt:
-    """Ten seconds at one junction, of a real recording or of a stream."""
+    """Ten seconds at one junction, from a real recording or a stream."""
 
     junction: str
     hazard: bool
@@ -52,10 +54,10 @@ class Excerpt:
 
     @classmethod
     def of(cls, junction: str, side: str, t0_s: float, time_s: FloatArray, columns: FloatArray) -> "Excerpt":
-        """Return what is compared of the hops of an excerpt.
+        """Return the compared statistics of the hops of an excerpt.
 
-        Times count from the start of the excerpt; `side` is left, right or none; columns (n, 13) are those of
-        `COLUMNS`, NaN where the guard refused the sound.
+        Times are relative to the start of the excerpt; `side` is left, right or none; columns (n, 13) are
+        those of `COLUMNS`, NaN if the guard rejected the sound.
         """
         known = np.isfinite(columns).all(axis=1)
         rows = _over_quiet(_as_from_the_left(columns[known], side))
@@ -85,7 +87,7 @@ def _as_from_the_left(columns: FloatArray, side: str) -> FloatArray:
 
 
 def _over_quiet(rows: FloatArray) -> FloatArray:
-    """Return the rows with their levels in dB over what the quietest fifth so far stays below."""
+    """Return the rows with their levels in dB above the 20 % quantile of the rows so far."""
     levels, ends = DB * rows[:, _LEVELS], range(1, len(rows) + 1)
     quiet = [np.quantile(levels[:end], QUIET_SHARE, axis=0, method="lower") for end in ends]
     rows[:, _LEVELS] = levels - np.reshape(quiet, levels.shape)
@@ -93,15 +95,15 @@ def _over_quiet(rows: FloatArray) -> FloatArray:
 
 
 def _autocorrelation(rows: FloatArray, lag_s: float) -> FloatArray:
-    """Return the correlation with what was so much earlier, shape (1, 11)."""
+    """Return the correlation with the values of `lag_s` before, shape (1, 11)."""
     lag, off = round(lag_s / _HOP_S), rows - known_mean(rows)
     return ratio(known_mean(off[lag:] * off[:-lag]), known_mean(off**2))[None]
 
 
 def stream_excerpts(heard: HeardStream, columns: FloatArray) -> list[Excerpt]:
-    """Cut a stream into excerpts: approaches before which no other vehicle is in view, or all of a quiet one.
+    """Cut a stream into excerpts: approaches without another vehicle in view before, or all of a quiet one.
 
-    Shapes: columns (n, 13), those of the hops.
+    Shapes: columns (n, 13), one row per hop.
     """
     time_s, vehicles, rows = heard.hops.time_s, heard.vehicles, heard.rows
     first, last = time_s[0] - 1.0, time_s[-1] - LENGTH_S
@@ -118,7 +120,7 @@ def stream_excerpts(heard: HeardStream, columns: FloatArray) -> list[Excerpt]:
                 begins.append((begin, str(arm)))
     found = []
     for begin, side in begins:
-        # A recording has its first hop after a second.
+        # The first hop of a recording is at one second.
         inside = (time_s > begin + 1.0 - _HOP_S / 2.0) & (time_s <= begin + LENGTH_S)
         found.append(Excerpt.of(heard.site, side, T0_S, time_s[inside] - begin, columns[inside]))
     return found
@@ -128,28 +130,29 @@ def stream_excerpts(heard: HeardStream, columns: FloatArray) -> list[Excerpt]:
 class Distances:
     """Squared distances of every column, shape (11,) each, and ratios of simulated to real distances."""
 
-    real: FloatArray  # Of real junctions from one another
-    halves: FloatArray  # Of halves of one real junction, zero but for chance
-    simulated: FloatArray  # Of simulated junctions from real ones
+    real: FloatArray  # Between real junctions
+    halves: FloatArray  # Between halves of one real junction, zero except for chance
+    simulated: FloatArray  # Between simulated and real junctions
     ratios: tuple[Value, ...]  # sqrt(simulated / real) with its interval over recordings
     median: Value  # Of these ratios
-    mean: Value  # The same ratio of the squared distances' means over columns, which chance moves less
+    # The same ratio for the means of the squared distances over columns, which is less affected by chance
+    mean: Value
 
 
 def column_distances(
     real: Sequence[Excerpt], simulated: Sequence[Excerpt], rng: np.random.Generator, draws: int = DRAWS
 ) -> Distances:
-    """Measure how far simulated junctions are from real ones, beside real ones from one another."""
+    """Measure the distances of simulated junctions from real ones, and of real ones from one another."""
     every = [*real, *simulated]
     pairwise = np.array([_pairwise(every, name, width) for name, width in _scales(real).items()])
-    # The same junction may be simulated, too.
+    # A simulated junction may have the name of a real one.
     strata = [(i >= len(real), one.junction, one.hazard) for i, one in enumerate(every)]
     parts = sorted({one[:2] for one in strata})
     inside = np.array([[one[:2] == part for one in strata] for part in parts], np.float64)
     n = sum(not simulated_too for simulated_too, _ in parts)
 
     def squared(times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return those of real junctions from one another and of simulated from real, of a draw."""
+        """Return the squared distances between real junctions and from simulated to real ones, in a draw."""
         some = _squared(pairwise, inside * times)
         return known_mean(some[np.triu_indices(n, 1)]), known_mean(some[n:, :n].reshape(-1, len(COMPARED)))
 
@@ -165,14 +168,14 @@ def column_distances(
 
 
 def _ratios(simulated: FloatArray | float, real: FloatArray | float) -> FloatArray:
-    """Return ratios of distances, from squared ones that chance may have made negative."""
+    """Return ratios of distances from squared ones, which may be negative by chance."""
     return np.asarray(np.sqrt(np.maximum(simulated, 0.0) / np.maximum(real, _LEAST)))
 
 
 def _halves(
     strata: Sequence[tuple[bool, str, bool]], pairwise: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return the mean squared distance of both halves of each real junction, dealt by lot, shape (11,)."""
+    """Return the mean squared distance between two random halves of each real junction, shape (11,)."""
     number, dealt = len(strata), np.zeros((2, len(strata)))
     for one in set(strata):
         some = rng.permutation([i for i in range(number) if strata[i] == one])
@@ -184,17 +187,17 @@ def _halves(
 
 
 def _scales(real: Sequence[Excerpt]) -> dict[str, FloatArray]:
-    """Return the interquartile range of every statistic that any recording has, shape (11,) each."""
+    """Return the interquartile range of every statistic that occurs in any recording, shape (11,) each."""
     names = dict.fromkeys(name for one in real for name, rows in one.statistics.items() if len(rows))
     rows = {name: [one.statistics[name] for one in real if name in one.statistics] for name in names}
     ends = {name: np.quantile(np.concatenate(some), (0.25, 0.75), axis=0) for name, some in rows.items()}
     widths = {name: np.ptp(both, axis=0) for name, both in ends.items()}
-    # What is the same in all real recordings tells no two apart.
+    # A value that is equal in all real recordings separates no junctions.
     return {name: np.where(width > 0.0, width, np.inf) for name, width in widths.items()}
 
 
 def _pairwise(every: Sequence[Excerpt], name: str, width: FloatArray) -> FloatArray:
-    """Return the mean absolute difference of every two excerpts, shape (n, n, 11); NaN if one has no row."""
+    """Return the mean absolute difference of each pair of excerpts, shape (n, n, 11); NaN without rows."""
     found = np.full((len(every), len(every), len(COMPARED)), np.nan)
     having = [i for i, one in enumerate(every) if len(one.statistics.get(name, ()))]
     rows = {i: every[i].statistics[name] / width for i in having}
@@ -206,7 +209,7 @@ def _pairwise(every: Sequence[Excerpt], name: str, width: FloatArray) -> FloatAr
 
 
 def _squared(pairwise: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the squared distance of every two parts, which hold each excerpt so many times.
+    """Return the squared distance of each pair of parts, given how often each contains every excerpt.
 
     Shapes: pairwise (statistics, n, n, 11), times (parts, n), returns (parts, parts, 11).
     """

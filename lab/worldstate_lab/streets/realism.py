@@ -1,8 +1,8 @@
-"""How far simulated windows are from real ones, beside how far real junctions are from one another.
+"""Distances between simulated and real windows, compared with distances between real junctions.
 
-Every figure of simulated against real stands beside the same figure of real against real, and is inside where
-it is no worse than some real junctions are to others. Absolute figures mislead: real junctions are told from
-one another by boosting at .92 to .96.
+Every figure of simulated against real windows is compared with the same figure of real against real. It is
+inside if it is no worse than between some real junctions. Absolute figures mislead: boosting separates real
+junctions from one another with 0.92 to 0.96.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -32,32 +32,32 @@ from .simulated_windows import TOLERANCE, FigureKey, agreeing_medians, median_ro
 
 Span = tuple[float, float]
 
-# Beside each, the figure of the released windows, or of real against real.
+# The comment of each line is the figure of the released windows, or of real against real.
 _ASKED: dict[FigureKey, Span] = {
-    ("C2ST", "all"): (0.0, 0.96),  # .925 to .963 between groupings of real junctions
-    ("between-site share of pattern", "hidden"): (0.45, 1.0),  # .57
-    ("iqr of log prominence", "none"): (0.0, 0.20),  # .131
-    ("share of peaks at 40 to 65 deg", "hidden"): (0.75, 0.95),  # .89
-    ("area of the second half's peak", "hidden, none"): (0.85, 1.0),  # .945
-    ("transfer, simulated to real", "hidden, none"): (0.93, 1.0),  # .909 to .993
-    ("side, real to simulated", "mean"): (0.75, 1.0),  # .95
+    ("C2ST", "all"): (0.0, 0.96),  # 0.925 to 0.963 between groupings of real junctions
+    ("between-site share of pattern", "hidden"): (0.45, 1.0),  # 0.57
+    ("iqr of log prominence", "none"): (0.0, 0.20),  # 0.131
+    ("share of peaks at 40 to 65 deg", "hidden"): (0.75, 0.95),  # 0.89
+    ("area of the second half's peak", "hidden, none"): (0.85, 1.0),  # 0.945
+    ("transfer, simulated to real", "hidden, none"): (0.93, 1.0),  # 0.909 to 0.993
+    ("side, real to simulated", "mean"): (0.75, 1.0),  # 0.95
     ("side, simulated to real", "mean"): (0.75, 1.0),
 }
-# No site may be told worse than by chance, and no classifier may rank as well with wrong positions.
+# No site may have a side accuracy below chance, and no classifier may rank as well with wrong positions.
 _ASKED_BY_FIGURE: dict[str, Span] = {
     "side, real to simulated": (0.5, 1.0),
     "side, simulated to real": (0.5, 1.0),
     "loss by permuted positions: published, of simulated": (0.10, 1.0),
     "loss by permuted positions: shipped model": (0.10, 1.0),
 }
-# The spread of the level within each class, of the real one.
+# Permitted relative difference of the level's spread within each class from the real one.
 _LEVEL_TOLERANCE = 0.25
-# A moving ego covers distant vehicles by its own noise: the published classifier loses most of its area.
+# The noise of a moving ego masks distant vehicles: the published classifier loses most of its area.
 _MOVING_TRANSFER = (0.70, 1.0)
 
 
 def asked_of(figure: str, windows: str, real: float | None, *, moving: bool = False) -> Span | None:
-    """Return the span in which a simulated figure is asked to be, None where nothing is asked.
+    """Return the span that a simulated figure should lie in, or None if there is no requirement.
 
     Examples
     --------
@@ -73,13 +73,13 @@ def asked_of(figure: str, windows: str, real: float | None, *, moving: bool = Fa
 
 @dataclass(frozen=True, slots=True)
 class Grouping:
-    """Two sets of junctions that have none in common."""
+    """Two disjoint sets of junctions."""
 
     one: tuple[str, ...]
     other: tuple[str, ...]
 
     def tables(self, table: FeatureTable) -> tuple[FeatureTable, FeatureTable]:
-        """Return the windows of either set."""
+        """Return the windows of each set."""
         one, other = (table.select(np.isin(table.environments, names)) for names in (self.one, self.other))
         return one, other
 
@@ -88,20 +88,20 @@ class Grouping:
 
 
 def halves(sites: list[str]) -> tuple[Grouping, ...]:
-    """Return the splits into two as equal sets as possible, of which both hold both types where any does.
+    """Return the splits into two nearly equal sets; if possible, each set contains both types.
 
     Examples
     --------
     >>> [str(one) for one in halves(["SA1", "SA2", "SB1", "SB2"])]
     ['SA1 SB1 | SA2 SB2', 'SA1 SB2 | SA2 SB1']
     """
-    # As equal as possible: one junction against four is told apart at .99, whatever it is.
+    # Nearly equal: any single junction is separated from four others with an area of 0.99.
     found = []
     for one in combinations(sites, len(sites) // 2):
         other = tuple(name for name in sites if name not in one)
-        if len(one) < len(other) or one[0] == sites[0]:  # of equal sets every split comes twice
+        if len(one) < len(other) or one[0] == sites[0]:  # with equal sets every split occurs twice
             found.append(Grouping(one, other))
-    # Type A against type B would measure the wall across the street (transfer .87).
+    # Type A against type B would measure the effect of the wall across the street (transfer 0.87).
     mixed = [one for one in found if len(_types(one.one)) == len(_types(one.other)) == len(_types(sites))]
     return tuple(mixed or found)
 
@@ -117,7 +117,7 @@ def within_types(sites: list[str]) -> tuple[Grouping, ...]:
     found = []
     for name in sites:
         others = tuple(other for other in sites if other != name and other[:2] == name[:2])
-        # Of two junctions of a type the one order is the other.
+        # For two junctions of a type, only one of the two orders.
         if others and (len(others) > 1 or name < others[0]):
             found.append(Grouping((name,), others))
     return tuple(found)
@@ -130,41 +130,41 @@ def _types(sites: tuple[str, ...] | list[str]) -> set[str]:
 def distance_figures(
     one: FeatureTable, other: FeatureTable, rng: np.random.Generator | None
 ) -> dict[FigureKey, float]:
-    """Return what tells two sets apart: C2ST, where there is a generator, and the area of each measure."""
+    """Return the separability of two sets: C2ST, if there is a generator, and the area of each measure."""
     boosted = {} if rng is None else {("C2ST", "all"): two_sample_area(one, other, rng)}
     single = measure_areas(one, other)
     return boosted | {(f"AUROC of {name}", windows): area for (name, windows), area in single.items()}
 
 
-# Figures of which only one end of the range can be missed; the rest may be neither lower nor higher.
+# Figures that are limited on one side only; the others may be neither too low nor too high.
 LOWER_IS_NEARER = ("C2ST", "AUROC of")
 HIGHER_IS_NEARER = ("share of medians", "side", "transfer")
-# The untrained scalar is there to be beaten, not to be reached.
+# The untrained scalar is a baseline to exceed, not a target.
 _NO_VERDICT = "loudest direction"
 _WAYS = ("real to simulated", "simulated to real")
 
 
 @dataclass(frozen=True, slots=True)
 class RealismRow:
-    """One figure of real windows, of real against real, and of simulated ones."""
+    """One figure of real windows, of real against real, and of simulated windows."""
 
     figure: str
     windows: str
     real: float | None  # Of all real windows
-    halves: Span | None  # Smallest and largest of real against real: groupings, junctions of a type
+    halves: Span | None  # Smallest and largest value of real against real: groupings, junctions of a type
     junctions: Span | None
-    allowed: Span | None  # Where a simulated figure is inside
+    allowed: Span | None  # Range of a simulated figure that counts as inside
     simulated: Mapping[str, float]
     asked: Span | None = None
 
     @property
     def inside(self) -> dict[str, bool | None]:
-        """Whether each simulated figure is in the range of real against real, None where there is none."""
+        """Whether each simulated figure is in the range of real against real, None if there is none."""
         return _within(self.simulated, self.allowed)
 
     @property
     def met(self) -> dict[str, bool | None]:
-        """Whether each simulated figure is where it is asked to be, None where nothing is asked."""
+        """Whether each simulated figure meets its requirement, None if there is none."""
         return _within(self.simulated, self.asked)
 
 
@@ -179,9 +179,9 @@ def pair_rows(
     groupings: tuple[Sequence[Grouping], Sequence[Grouping]],
     rngs: tuple[np.random.Generator, np.random.Generator] | None,
 ) -> list[RealismRow]:
-    """Return what tells two sets apart, what a classifier of one makes of the other, and agreeing medians.
+    """Return separability of two sets, transfer of classifiers between them, and agreement of medians.
 
-    Without generators no classifier is trained; the single measures are left.
+    Without generators no classifier is trained, and only the single measures are returned.
     """
     of_real, of_simulated = rngs or (None, None)
     by_halves, by_junction = (_spans(_real_pairs(real, some, of_real)) for some in groupings)
@@ -197,7 +197,8 @@ def pair_rows(
     for figure, windows in keys:
         undirected = figure.partition(",")[0], windows
         between, within = by_halves.get(undirected), by_junction.get(undirected)
-        # A single measure may be as far off as between any two real junctions; the rest as between groupings.
+        # A single measure may differ as much as between any two real junctions; other figures as between
+        # groupings.
         spans = [span for span in (between, within if figure.startswith("AUROC of") else None) if span]
         key = figure, windows
         found = {name: figures[key] for name, figures in ours.items() if key in figures}
@@ -231,7 +232,7 @@ def _spans(found: Iterable[Mapping[FigureKey, float]]) -> dict[FigureKey, Span]:
 
 
 def allowed_span(figure: str, spans: Sequence[Span]) -> Span | None:
-    """Return the range that holds all spans, open to the side on which a figure is nearer.
+    """Return the range that contains all spans, open on the side where a figure is nearer.
 
     Examples
     --------
@@ -245,7 +246,7 @@ def allowed_span(figure: str, spans: Sequence[Span]) -> Span | None:
 
 
 def median_figures(real: FeatureTable, simulated: Mapping[str, FeatureTable]) -> list[RealismRow]:
-    """Return the medians by type of junction and class, inside where they are within 15 %."""
+    """Return the medians by type of junction and class; inside means within 15 %."""
     ours = {name: median_rows(real, table) for name, table in simulated.items()}
     rows = []
     for key, (middle, _) in median_rows(real, real).items():
@@ -258,10 +259,10 @@ def median_figures(real: FeatureTable, simulated: Mapping[str, FeatureTable]) ->
 def set_rows(
     real: FeatureTable, simulated: Mapping[str, FeatureTable], groupings: Iterable[Grouping]
 ) -> list[RealismRow]:
-    """Return what one set has by itself, beside the halves of the real junctions."""
-    # Halves stand for streets of which only so many were recorded: spreads of two or three junctions.
+    """Return the figures of a single set, compared with halves of the real junctions."""
+    # Halves show the variation for so few streets: the spread of two or three junctions.
     parts = [part for grouping in groupings for part in grouping.tables(real)]
-    # A share between sites needs two of them.
+    # A share between sites needs at least two sites.
     spans = _spans(set_figures(part) for part in parts if len(set(part.environments.tolist())) > 1)
     ours = {name: set_figures(table) for name, table in simulated.items()}
     rows = []
@@ -272,7 +273,7 @@ def set_rows(
 
 
 def side_rows(real: FeatureTable, simulated: Mapping[str, FeatureTable]) -> list[RealismRow]:
-    """Return how often left is told from right, real on real beside either way, at each junction."""
+    """Return the accuracy of left against right at each junction, compared with real on real."""
     known = _with_mean(side_accuracy(real, real))
     span = (min(known.values()), max(known.values())) if known else None
     allowed, rows = allowed_span("side", [span] if span else []), []
@@ -292,7 +293,7 @@ def _with_mean(by_site: Mapping[str, float]) -> dict[str, float]:
 
 
 def position_rows(figures: Mapping[str, Mapping[FigureKey, float]]) -> list[RealismRow]:
-    """Return what is lost with permuted positions; there is no real sound to compute the same from."""
+    """Return the loss with permuted positions; there is no real counterpart, because no real sound is released."""
     keys = dict.fromkeys(key for one in figures.values() for key in one)
     return [
         RealismRow(*key, None, None, None, None, {name: one[key] for name, one in figures.items()})
@@ -305,7 +306,7 @@ Profile = tuple[tuple[float, ...], ...]  # Halves x far azimuths
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Realism:
-    """The comparison: figures, transfers with intervals, and what follows the side at each junction."""
+    """The comparison: figures, transfers with intervals, and the odd part by side at each junction."""
 
     groupings: tuple[str, ...]
     rows: tuple[RealismRow, ...]
@@ -313,7 +314,7 @@ class Realism:
     profiles: Mapping[str, Mapping[str, Profile]]  # By set and junction
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; every row says what is inside, and met."""
+        """Return plain values for JSON; every row includes `inside` and `met`."""
         rows = [encode(row) | {"inside": row.inside, "met": row.met} for row in self.rows]
         return {**encode(self), "rows": rows}
 
@@ -327,28 +328,28 @@ def measure_realism(
     classifiers: bool = True,
     draws: int = DRAWS,
 ) -> Realism:
-    """Hold sets of simulated windows against real ones, and real junctions against one another.
+    """Compare sets of simulated windows with real ones, and real junctions with one another.
 
     Parameters
     ----------
     real : FeatureTable
         Released windows.
     simulated : mapping of str to FeatureTable
-        Simulated windows by the name of their set, such as a seed; none for real against real alone.
+        Simulated windows by name of their set, such as a seed; empty for real against real only.
     rng : numpy.random.Generator
         Folds and bootstrap.
     permuted : mapping of str to FeatureTable, optional
-        The same simulated windows, row by row, with the microphones' positions permuted.
+        The same simulated windows, row by row, with permuted microphone positions.
     classifiers : bool
-        False leaves out whatever a classifier is trained for (C2ST, transfer, side, positions): streets are
-        tuned on single measures alone.
+        False leaves out all figures that need a trained classifier (C2ST, transfer, side, positions). Streets
+        are tuned on single measures only.
     draws : int
         Bootstrap samples of recordings for the intervals of the transfers.
 
     Returns
     -------
     Realism
-        Every figure beside the same one of real against real.
+        Every figure with the same figure of real against real.
 
     Raises
     ------
@@ -373,9 +374,9 @@ def measure_realism(
             raise InvalidArgumentError(f"{name}: expected hazard and hazard-free windows")
     sites = sorted(set(real.environments.tolist()))
     groupings = (halves(sites) if len(sites) > 1 else (), within_types(sites))
-    # The figures of real against real are the same beside any simulation.
+    # The figures of real against real must not depend on the simulation.
     of_real, of_simulated = rng.spawn(2)
-    # Each way once, with its interval: the rows show the same areas.
+    # Each direction once, with its interval: the rows use the same areas.
     transfers = {}
     for name, table in simulated.items() if classifiers else ():
         transfers[f"{name} -> real"] = published_transfer(table, real, of_simulated, draws)
@@ -398,7 +399,7 @@ def measure_realism(
 
 
 def realism_lines(found: Realism) -> list[str]:
-    """Return figures, transfers and profiles; `!` marks what is outside, `x` what is not as asked."""
+    """Return figures, transfers and profiles; `!` marks values outside, `x` missed requirements."""
     names = list(dict.fromkeys(name for row in found.rows for name in row.simulated))
     spans = "real against real", "of a type", "asked"
     rows = [_row_cells(row, names) for row in found.rows]

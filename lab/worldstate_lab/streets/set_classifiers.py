@@ -1,9 +1,9 @@
-"""What classifiers make of two sets of windows.
+"""Figures of classifiers on two sets of windows.
 
-Two-sample tests (how well the sets are told apart), transfer (the published classifier, trained on one set
-and tested on the other), the side of a hidden vehicle at junctions that a classifier has not heard, and what
-classifiers lose when the microphones are not where the features take them to be: one that ranks as well with
-permuted positions takes the level for the direction.
+They are two-sample tests (separability of the sets), transfer (the published classifier, trained on one set
+and tested on the other), the side of a hidden vehicle at junctions outside the training data, and the loss if
+the microphones are at other positions than the features assume. A classifier without this loss uses the level
+instead of the direction.
 """
 
 from dataclasses import dataclass
@@ -37,15 +37,15 @@ from .simulated_windows import (
 
 
 def two_sample_area(one: FeatureTable, other: FeatureTable, rng: np.random.Generator) -> float:
-    """Return the area of a boosted classifier on descriptors and log features that tells two sets apart."""
-    # By recording: the hidden and the front window of one vehicle are alike.
+    """Return the area of a boosted classifier on descriptors and log features that separates two sets."""
+    # By recording: the hidden and the front window of one vehicle are similar.
     folds = [folds_by_recording(table, rng) for table in (one, other)]
     inputs = np.concatenate([_inputs(table.features) for table in (one, other)])
     return boosted_area(inputs, np.repeat([0, 1], [len(one), len(other)]), np.concatenate(folds), rng)
 
 
 def boosted_area(inputs: FloatArray, origin: IndexArray, fold: AnyArray, rng: np.random.Generator) -> float:
-    """Return the area of a boosted classifier that tells rows of origin 0 and 1 apart, out of fold.
+    """Return the out-of-fold area of a boosted classifier that separates rows of origin 0 and 1.
 
     Shapes: inputs (n, m), origin, fold (n,).
     """
@@ -54,8 +54,8 @@ def boosted_area(inputs: FloatArray, origin: IndexArray, fold: AnyArray, rng: np
     with threadpool_limits(1):  # a few hundred rows: threads cost more than they save
         for held_out in np.unique(fold):
             test = fold == held_out
-            # A linear classifier finds less (.79 for .92). Fewer iterations would do, but figures of earlier
-            # streets were measured with these.
+            # A linear classifier finds less (0.79 against 0.92). Fewer iterations would suffice, but earlier
+            # figures were measured with this number.
             model = HistGradientBoostingClassifier(max_iter=100, random_state=seed)
             score[test] = model.fit(inputs[~test], origin[~test]).predict_proba(inputs[test])[:, 1]
     return auroc(score, origin) or 0.5
@@ -67,7 +67,7 @@ def _inputs(features: FloatArray) -> FloatArray:
 
 
 def measure_areas(one: FeatureTable, other: FeatureTable) -> dict[FigureKey, float]:
-    r"""Return how well each measure alone tells the sets apart, whichever way: max(a, 1 - a), by class.
+    r"""Return how well each measure alone separates the sets, in either direction: max(a, 1 - a), by class.
 
     Examples
     --------
@@ -92,18 +92,18 @@ def measure_areas(one: FeatureTable, other: FeatureTable) -> dict[FigureKey, flo
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """Hidden against empty windows of one set, by a classifier trained on another."""
+    """Hidden against empty windows of one set, with a classifier trained on another."""
 
     windows: int
-    auroc: float  # Area of the classifier and of the loudest direction on the same windows
+    auroc: float  # Area of the classifier, and below of the loudest direction, on the same windows
     scalar: float
-    gain: Interval | None  # Middle 95 % of their difference over bootstrap samples of recordings
+    gain: Interval | None  # Central 95 % of their difference over bootstrap samples of recordings
 
 
 def published_transfer(
     train: FeatureTable, test: FeatureTable, rng: np.random.Generator, draws: int = 0
 ) -> Transfer:
-    """Train on one set and rank the windows of another; intervals where `draws` are asked for."""
+    """Train on one set and rank the windows of another; with `draws`, also compute an interval."""
     score = trained_score(train, rng, test.features)
     loudest = test.features.max(axis=1)
     gains = [
@@ -116,15 +116,15 @@ def published_transfer(
 
 
 def trained_score(train: FeatureTable, rng: np.random.Generator, features: FloatArray) -> FloatArray:
-    """Return P(hidden) over P(hidden) + P(none) of features, by the published classifier on log features."""
-    # Logarithms travel better than raw features (.98 for .95 from real to simulated sound), and front windows
-    # are neither hidden nor empty: they do not enter the ratio.
+    """Return P(hidden) / (P(hidden) + P(none)) of features by the published classifier on log features."""
+    # Logarithms transfer better than raw features (0.98 against 0.95 from real to simulated sound). Front
+    # windows are neither hidden nor empty and do not enter the ratio.
     classifier = PublishedClassifier(rng).fit(np.log(train.features), train.labels)
     return hazard_statistic(classifier.predict_proba(np.log(features)), miss_rate=0.0)
 
 
 def area_of(score: FloatArray, table: FeatureTable, rows: IndexArray | None = None) -> float:
-    """Return the area of hidden above empty windows, NaN where a class is missing."""
+    """Return the area of hidden above empty windows, NaN if a class is missing."""
     rows = np.arange(len(table)) if rows is None else rows
     scored = rows[(table.hazards | table.hazard_free)[rows]]
     area = auroc(score[scored], table.hazards[scored])
@@ -135,15 +135,16 @@ FAR_AZIMUTHS_DEG = AZIMUTHS_DEG[len(AZIMUTHS_DEG) // 2 :]
 
 
 def side_accuracy(train: FeatureTable, test: FeatureTable) -> dict[str, float]:
-    """Return how often left is told from right at each junction of `test`, trained on other junctions.
+    """Return the accuracy of left against right at each junction of `test`, trained on other junctions.
 
-    A linear support vector machine on standardised log features and their mirror images. A junction of
-    `test` that `train` knows by name is left out of the training.
+    The classifier is a linear support vector machine on standardised log features and their mirror images. If
+    `train` contains a junction of `test`, the junction is left out of the training.
     """
     levels = [np.log(table.features) for table in (train, test)]
     found = {}
     for site in np.unique(test.environments[test.hazards]):
-        # Real on real has to leave the junction out; the others do, so that all learn from as many.
+        # Real on real must leave the junction out. The other cases do too, so that all use training sets of
+        # equal size.
         learned = train.hazards & (train.environments != site)
         asked = test.hazards & (test.environments == site)
         right = np.asarray(train.labels[learned] == "right")
@@ -155,21 +156,22 @@ def side_accuracy(train: FeatureTable, test: FeatureTable) -> dict[str, float]:
 
 def _told_right(levels: FloatArray, right: BoolArray, asked: FloatArray) -> FloatArray:
     inputs = np.concatenate([levels, mirror_features(levels)])
-    # Real on real: .95 by this machine, .87 by the published classifier of four classes, .81 by a logistic
-    # regression without mirror images. A weaker one would leave open whether the street or it is at fault.
+    # Real on real: 0.95 with this machine, 0.87 with the published four-class classifier, 0.81 with a
+    # logistic regression without mirror images. With a weaker classifier it would be unclear whether a low
+    # accuracy comes from the street or from the classifier.
     mean, scale = standardisation(inputs)
     machine = SVC(kernel="linear").fit((inputs - mean) / scale, np.concatenate([right, ~right]))
     return np.asarray(machine.predict((asked - mean) / scale))
 
 
 def odd_profiles(table: FeatureTable) -> dict[str, FloatArray]:
-    r"""Return what of the pattern follows the vehicle's side, at each junction: shape (2, 15), nats.
+    r"""Return the part of the pattern that depends on the vehicle's side, at each junction: (2, 15), nats.
 
     .. math:: d = \tfrac12 \big( \overline{\log f}_{left} - \overline{\log f}_{right} \big), \qquad
               o(\theta) = \tfrac12 [d(\theta) - d(-\theta)], \quad \theta > 0 \text{ to the right}
 
-    Either half of the window, at `FAR_AZIMUTHS_DEG` of the far side: positive where the far side is louder.
-    The mean of the junction is the same in both terms and cancels.
+    It has a row for each half of the window, at `FAR_AZIMUTHS_DEG` of the far side, and is positive if the
+    far side is louder. The mean of the junction is equal in both terms and cancels.
     """
     found = {}
     for site in np.unique(table.environments[table.hazards]):
@@ -179,7 +181,7 @@ def odd_profiles(table: FeatureTable) -> dict[str, FloatArray]:
         ]
         if min(map(len, means)):
             left, right = (one.mean(axis=0).reshape(SEGMENTS, -1) for one in means)
-            # Half of it: how far either side is from their mean.
+            # Half of the difference: the distance of either side from their mean.
             difference = 0.5 * (left - right)
             odd = 0.5 * (difference - difference[:, ::-1])
             found[str(site)] = odd[:, odd.shape[1] // 2 :]
@@ -189,10 +191,10 @@ def odd_profiles(table: FeatureTable) -> dict[str, FloatArray]:
 def position_figures(
     real: FeatureTable, right: FeatureTable, permuted: FeatureTable, rng: np.random.Generator
 ) -> dict[FigureKey, float]:
-    """Return what permuted positions take from the area of hidden above empty windows.
+    """Return the loss in the area of hidden above empty windows with permuted positions.
 
-    By the published classifier trained on the real windows, by the same trained on the right ones of other
-    recordings, and by the model that ships.
+    It is computed for the published classifier trained on the real windows, for the same classifier trained
+    on correct windows of other recordings, and for the shipped model.
     """
     both = np.concatenate([right.features, permuted.features])
     scores = {
@@ -208,7 +210,8 @@ def position_figures(
 
 
 def _out_of_fold(right: FeatureTable, permuted: FeatureTable, rng: np.random.Generator) -> FloatArray:
-    # Trained with the right positions alone; other recordings, or it would know the windows themselves.
+    # Training uses only correct positions, and only other recordings, because otherwise the test windows
+    # would be in the training set.
     folds = folds_by_recording(right, rng)
     scores = np.empty((2, len(right)))
     for held_out in np.unique(folds):

@@ -1,11 +1,12 @@
-"""Labelled feature windows of simulated junctions, laid out as the released real ones.
+"""Labelled feature windows of simulated junctions, in the layout of the released real ones.
 
-The program released with the real recordings says where its windows lie. With a standing ego the hazard and
-hazard-free windows end at T0, the frame of the 10-Hz video in which the vehicle comes into sight; with a
-moving ego they end 0.5 s later. The front window ends 1.5 s after the first. Rendered at a quarter of the
-array's rate with a quarter of the frame length, which leaves the feature's bins (50-1500 Hz) where they are.
+The times of the windows follow the program released with the real recordings. With a standing ego, the hazard
+and hazard-free windows end at T0, the frame of the 10-Hz video in which the vehicle comes into sight; with a
+moving ego they end 0.5 s later. The front window ends 1.5 s after the first. Sound is rendered at a quarter
+of the array's rate with a quarter of the frame length, which leaves the feature's bins (50-1500 Hz)
+unchanged.
 
-Of one set of windows there are measures, and figures of these: medians, spreads, what belongs to the site.
+A set of windows has measures and figures computed from them: medians, spreads, and shares between sites.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,24 +32,24 @@ from worldstate.simulation.scene.settings import SimulationSettings, draw_settin
 DESCRIPTORS = ("level", "peak", "width_deg", "prominence", "change")
 MEASURES = (*DESCRIPTORS, "position_deg")
 CLASS_GROUPS = {"hidden": ("left", "right"), "front": ("front",), "none": ("none",)}
-# Junctions of a standing and of a moving ego; A has a wall across the street, B none.
+# Junctions with a standing and a moving ego; type A has a wall across the street, type B has none.
 TYPES = {"A": "SA", "B": "SB", "moving A": "DA", "moving B": "DB"}
-# The published feature has 30 azimuths over half a circle, for either half of its window.
+# The published feature has 30 azimuths over half a circle, for each half of its window.
 AZIMUTHS_DEG = np.linspace(-90.0, 90.0, 30)
 AZIMUTH_STEP_DEG = 180.0 / 29.0
 SEGMENTS = 2
 
 
 def of_class(table: FeatureTable, windows: str) -> BoolArray:
-    """Return where a window is of one of `CLASS_GROUPS`."""
+    """Return a mask of the windows in one of `CLASS_GROUPS`."""
     return np.isin(table.labels, CLASS_GROUPS[windows])
 
 
 def describe_windows(features: FloatArray) -> dict[str, FloatArray]:
     """Return level and shape of windows, raw features (n, 60) -> (n,) for each of `MEASURES`."""
-    # level is the mean, peak the largest value, prominence the ratio of each segment's peak to its median
-    # (mean over segments), width_deg the azimuths above half way from median to peak, change the Euclidean
-    # distance of the segments, position_deg how far aside the peak of both segments' mean stands.
+    # level: mean. peak: largest value. prominence: ratio of each segment's peak to its median, averaged over
+    # segments. width_deg: azimuths above the midpoint of median and peak. change: Euclidean distance of the
+    # segments. position_deg: absolute azimuth of the peak of the mean of both segments.
     segments = features.reshape(len(features), SEGMENTS, -1)
     spectrum = segments.mean(axis=1)
     half = 0.5 * (spectrum.max(axis=1) + np.median(spectrum, axis=1))
@@ -63,15 +64,15 @@ def describe_windows(features: FloatArray) -> dict[str, FloatArray]:
 
 
 def spread_values(features: FloatArray) -> dict[str, FloatArray]:
-    r"""Return the values whose spread is told: natural logarithms, except of the two in degrees.
+    r"""Return the values whose spread is reported: natural logarithms, except for the two in degrees.
 
     .. math:: \text{level} = \tfrac{1}{60} \sum_i \log f_i, \qquad
               \text{prominence} = \tfrac12 \sum_s \log \big( \max_\theta f_s / \mathrm{med}_\theta f_s \big)
 
     Shapes: features (n, 60).
     """
-    # The logarithm of the mean would be less sensitive to quiet directions: .138 for .151 of the real hidden
-    # windows. The mean of logarithms is what a mean over a classifier's own inputs is.
+    # The logarithm of the mean would be less sensitive to quiet directions: 0.138 against 0.151 for the real
+    # hidden windows. The mean of logarithms corresponds to a mean over a classifier's inputs.
     measures = describe_windows(features)
     segments = np.log(features).reshape(len(features), SEGMENTS, -1)
     return {
@@ -84,16 +85,16 @@ def spread_values(features: FloatArray) -> dict[str, FloatArray]:
     }
 
 
-# (what is told, class of windows); the class is "all" where it is of several.
+# (name of the figure, class of windows); the class is "all" if the figure concerns several.
 FigureKey = tuple[str, str]
-# Where images in the side walls of the ego's own street stand: 89 % of the real hidden peaks.
+# Azimuths of mirror images in the side walls of the ego's own street: 89 % of the real hidden peaks.
 WIDE_DEG = (40.0, 65.0)
-# Spreads and shares of fewer windows are chance.
+# Spreads and shares of fewer windows are dominated by chance.
 LEAST_WINDOWS = 5
 
 
 def set_figures(table: FeatureTable) -> dict[FigureKey, float]:
-    """Return every figure that one set of windows has by itself."""
+    """Return every figure of a single set of windows."""
     figures: dict[FigureKey, float] = {}
     for windows in CLASS_GROUPS:
         chosen = table.select(of_class(table, windows))
@@ -108,7 +109,7 @@ def set_figures(table: FeatureTable) -> dict[FigureKey, float]:
 
 
 def second_half_area(table: FeatureTable) -> float | None:
-    """Return how well the peak of the second half alone ranks hidden above empty windows."""
+    """Return the area with which the peak of the second half alone ranks hidden above empty windows."""
     rows = table.hazards | table.hazard_free
     peaks = table.features.reshape(len(table), SEGMENTS, -1)[rows, -1].max(axis=1)
     return auroc(peaks, table.hazards[rows])
@@ -135,7 +136,7 @@ def _site_shares(table: FeatureTable) -> dict[str, float]:
 
 
 def between_share(values: FloatArray, sites: TextArray) -> float:
-    r"""Return the share of the variance that lies between the means of sites, summed over columns.
+    r"""Return the share of the variance that is between the means of sites, summed over columns.
 
     .. math:: \frac{\sum_s n_s \| \bar x_s - \bar x \|^2}{\sum_i \| x_i - \bar x \|^2}
 
@@ -153,7 +154,7 @@ def between_share(values: FloatArray, sites: TextArray) -> float:
 
 
 def _hidden_peaks(hidden: FeatureTable) -> dict[str, float]:
-    """Return how many peaks stand wide."""
+    """Return the share of hidden peaks at `WIDE_DEG`."""
     spectrum = hidden.features.reshape(len(hidden), SEGMENTS, -1).mean(axis=1)
     aside = np.abs(AZIMUTHS_DEG[spectrum.argmax(axis=1)])
     return {
@@ -161,7 +162,7 @@ def _hidden_peaks(hidden: FeatureTable) -> dict[str, float]:
     }
 
 
-# Real junctions of one type agree with one another within this in 18 to 24 of 30 rows.
+# Real junctions of one type agree with one another to within this in 18 to 24 of 30 rows.
 TOLERANCE = 0.15
 
 
@@ -189,14 +190,14 @@ def median_rows(one: FeatureTable, other: FeatureTable) -> dict[FigureKey, tuple
 
 DECIMATION = 4
 RATE_HZ = FEATURE_RATE_HZ / DECIMATION
-# Changes whenever a window of the same seed would be another one.
+# Increased whenever a window of the same seed would differ.
 LAYOUT = 4
-# The first window is a second long and ends at T0 at the earliest; the last ends a frame (.1 s), a moving
-# ego's delay (.5 s) and the front window's (1.5 s) after it.
+# The first window is one second long and ends at T0 at the earliest. The last window ends later by a frame
+# (0.1 s), a moving ego's delay (0.5 s) and the front window's delay (1.5 s).
 ENTRY_S, DURATION_S = 1.65, 3.8
 FRAME_S = 1.0 / FRAME_RATE_HZ
 MAX_PER_CLASS = 1000
-# Any permutation will do; one and the same, or seeds would differ by their arrays.
+# Any permutation is suitable, but it must be the same for all seeds, so that they share one array.
 PERMUTATION = 56
 
 
@@ -219,7 +220,7 @@ def simulated_window_pair(
     levels: Preset | None = None,
     progress: Callable[[], None] = lambda: None,
 ) -> tuple[FeatureTable, FeatureTable]:
-    """Simulate windows of junctions: their features, and those with the microphones' positions permuted."""
+    """Simulate windows of junctions: their features, and the features with permuted microphone positions."""
     in_range("per_approach", per_approach, 1, MAX_PER_CLASS)
     in_range("jobs", jobs, 1, 256)
     rows = []
@@ -246,7 +247,7 @@ def _plans(per_approach: int, seed: int, sites: Sequence[str]) -> list[WindowPla
 
 
 def windows_of_recording(levels: Preset, plan: WindowPlan) -> list[Row]:
-    """Simulate one recording and return the features of its windows by right and permuted positions."""
+    """Simulate one recording and return the features of its windows with correct and permuted positions."""
     rng = np.random.default_rng(plan.seed)
     scene = _scene(plan, levels, rng)
     first_frame_s = ENTRY_S + float(rng.uniform(0.0, FRAME_S))
@@ -260,7 +261,7 @@ def windows_of_recording(levels: Preset, plan: WindowPlan) -> list[Row]:
 
 
 def _scene(plan: WindowPlan, levels: Preset, rng: np.random.Generator) -> SimulationSettings:
-    """Draw a scene in which the vehicle, or the end of a hazard-free window, comes at `ENTRY_S`."""
+    """Draw a scene in which the vehicle comes, or a hazard-free window ends, at `ENTRY_S`."""
     drawn = draw_settings(plan.environment, plan.approach, rng, DURATION_S, levels=levels)
     ego = drawn.ego
     if not ego.stands:
@@ -275,7 +276,7 @@ def _cut(audio: Float32Array, start_s: float) -> Float32Array:
 
 @lru_cache(maxsize=1)
 def permuted_array() -> MicrophoneArray:
-    """Return OVAD's positions dealt to other channels, once for all: an array whose geometry is wrong."""
+    """Return OVAD's positions in a fixed permutation of the channels: an array with wrong geometry."""
     positions = ovad_array().positions_m
     return MicrophoneArray(positions[np.random.default_rng(PERMUTATION).permutation(len(positions))])
 

@@ -1,1 +1,1 @@
-"""Recordings as every method is given them: found, heard once, kept by their content, classified."""
+"""Recordings as trials for every method: found, processed once, cached by content, classified."""

@@ -1,4 +1,4 @@
-"""What a signature classifier finds in the features of trials, and the windows that it is trained on."""
+"""Log-likelihoods of signature classifiers on the features of trials, and their training windows."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -35,15 +35,15 @@ from worldstate_lab.streets.simulated_windows import LAYOUT, simulated_window_pa
 from .pass_cache import fingerprint, origin_of
 from .trial import TakeList, Trial
 
-# Hidden left and hidden right among the explanations.
+# Columns of hidden left and hidden right.
 SIDE_COLUMNS = slice(0, 2)
-# All of the windows; those of other junctions than the tested one; or, where nothing but the tested
-# recordings is at hand, windows cut from the calibration recordings of the fold.
+# All windows; those of junctions other than the tested one; or, if only the test recordings are available,
+# windows cut from the calibration recordings of the fold.
 TrainedOn = Literal["all", "other junctions", "calibration"]
 
 
 def classified(trial: Trial, name: str, signature: AnySignature) -> Trial:
-    """Add the log-likelihoods that a classifier gives, and its prior, under a name."""
+    """Add the log-likelihoods and the prior of a classifier to a trial, under a name."""
     model = SiteSignature(signature) if isinstance(signature, EnsembleModel) else signature
     evidence = np.stack([model.evidence(feature).log_likelihoods for feature in trial.hops.features])
     priors = {**trial.hops.about.get("prior", {}), name: list(signature.reference_prior)}
@@ -59,25 +59,25 @@ def posteriors(trial: Trial, evidence: str) -> FloatArray:
 
 @dataclass(slots=True)
 class Classifiers:
-    """The published classifier, trained for each fold on what that fold may know; each is trained once."""
+    """The published classifier, trained for each fold on the permitted windows; each training runs once."""
 
-    windows: FeatureTable | None  # Released, simulated or extracted ones; none of a tested recording
-    told: str = ""  # Where they come from, for the report
+    windows: FeatureTable | None  # Released, simulated or extracted windows; none of a test recording
+    told: str = ""  # Their origin, for the report
     _trained: dict[tuple[str, ...], dict[str, AnySignature]] = field(default_factory=dict)
     _heard: dict[tuple[tuple[str, ...], str], Trial] = field(default_factory=dict)
 
     def trained_on(self, kind: TrainedOn) -> TrainedOn:
-        """Return what is trained on: without windows the calibration recordings, whatever was asked for."""
+        """Return the training data in use: without windows always the calibration recordings."""
         return "calibration" if self.windows is None else kind
 
     def classify(
         self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial], seed: int
     ) -> tuple[list[Trial], list[Trial]]:
-        """Return both parts of a fold with the posteriors of the classifiers that belong to it."""
+        """Return both parts of a fold with the posteriors of the classifiers for this fold."""
         key = self._key(kind, calibration, tested, seed)
         if key not in self._trained:
             table = self._table(kind, calibration, tested)
-            # By the name of their evidence: the classifier of the paper, and the ensemble that this library
+            # By name of their evidence: the classifier of the paper, and the ensemble that this library
             # ships, both trained on the same windows.
             published = PublishedClassifier(np.random.default_rng(seed))
             self._trained[key] = {
@@ -88,7 +88,7 @@ class Classifiers:
         return before, after
 
     def _classified(self, key: tuple[str, ...], trial: Trial) -> Trial:
-        # The same classifiers hear the same trial in many folds and protocols.
+        # The same classifiers are applied to the same trial in many folds and protocols.
         if (key, trial.name) not in self._heard:
             heard = trial
             for name, signature in self._trained[key].items():
@@ -112,7 +112,7 @@ class Classifiers:
         shared = {trial.name for trial in tested} & set(table.ids.tolist())
         if shared:
             raise InvalidArgumentError(
-                f"windows: expected none of a tested recording, got those of {', '.join(sorted(shared)[:5])}"
+                f"windows: expected none of a test recording, got those of {', '.join(sorted(shared)[:5])}"
             )
         if kind == "other junctions":
             left_out = {junction_of(trial.site) for trial in tested}
@@ -123,7 +123,7 @@ class Classifiers:
 
 
 def junction_of(site: str) -> str:
-    """Return the junction of a site, whatever the ego does there.
+    """Return the junction of a site, for a standing or a moving ego.
 
     Examples
     --------
@@ -134,7 +134,7 @@ def junction_of(site: str) -> str:
 
 
 def windows_of(trials: Sequence[Trial]) -> FeatureTable:
-    """Cut labelled windows out of recordings that were heard: at T0, 1.5 s later, and amid quiet ones."""
+    """Cut labelled windows from processed recordings: at T0, 1.5 s later, and within hazard-free ones."""
     rows = []
     for trial in trials:
         time_s = trial.hops.time_s
@@ -144,7 +144,7 @@ def windows_of(trials: Sequence[Trial]) -> FeatureTable:
             wanted = {trial.label: trial.t0_s, FRONT: trial.t0_s + FRONT_LATER_S}
         for label, end_s in wanted.items():
             hop = int(np.abs(time_s - end_s).argmin())
-            # A window that ends elsewhere than it should is another window.
+            # If no hop ends at this time, the window would differ.
             if abs(time_s[hop] - end_s) <= 0.051:
                 rows.append((trial.hops.features[hop], label, trial.name, trial.site))
     if not rows:
@@ -153,15 +153,15 @@ def windows_of(trials: Sequence[Trial]) -> FeatureTable:
     return FeatureTable(features, labels, names, sites, names, (None,) * len(rows))
 
 
-# Changes whenever the same windows would give another model.
+# Increased whenever the same windows would give a different model.
 VERSION = 2
-# 170 windows of each class of left and right together, front and none at the five standing sites: the
-# released set has 170, 170 and 158 once its 42 + 42 and 41 test windows are taken away.
+# Gives 170 windows each of left and right together, front, and none at the five standing sites. The released
+# set has 170, 170 and 158 without its 42 + 42 and 41 test windows.
 PER_APPROACH = 17
 
 
 def windows_from_table(path: Path, takes: TakeList) -> tuple[FeatureTable, str]:
-    """Read a table of windows and leave out those of the tested recordings; say what was left out.
+    """Read a table of windows without those of the test recordings; return it with a description.
 
     Raises
     ------
@@ -179,11 +179,11 @@ def windows_from_table(path: Path, takes: TakeList) -> tuple[FeatureTable, str]:
     tested = {take.name for take in (*takes.static, *takes.dynamic)}
     kept = table.without(tested) if set(table.ids.tolist()) & tested else table
     left_out = len(table) - len(kept)
-    return kept, f"{len(kept)} windows of {path.name}, {left_out} of tested recordings left out"
+    return kept, f"{len(kept)} windows of {path.name}, {left_out} of test recordings left out"
 
 
 def windows_from_recordings(takes: TakeList, folder: Path) -> tuple[FeatureTable, str] | None:
-    """Extract the windows of the recordings that are not tested; None where there are none."""
+    """Extract the windows of the recordings that are not tested; None if there are none."""
     names = {take.name for take in takes.training}
     if not names:
         return None
@@ -197,7 +197,7 @@ def windows_from_recordings(takes: TakeList, folder: Path) -> tuple[FeatureTable
 
 
 def windows_origin(windows: Sequence[LabelledWindow], array: MicrophoneArray, memo: Path) -> str:
-    """Name what the features of windows depend on: sound, place in it, label and array, in 32 characters."""
+    """Return a hash of 32 characters of all inputs of window features: sound, time, label and array."""
     marks = {path: fingerprint(path, memo) for path in {window.path for window in windows}}
     listed = [
         (one.window_id, one.label, one.environment, one.t0_frame, one.end_s, marks[one.path])
@@ -215,18 +215,19 @@ def windows_from_simulation(
     jobs: int = 1,
     progress: Callable[[], None] = lambda: None,
 ) -> tuple[FeatureTable, str]:
-    """Simulate windows at the junctions of the tested recordings, from a seed of their own."""
+    """Simulate windows at the junctions of the test recordings, with a separate seed."""
     levels = preset(DEFAULT_PRESET)
     origin = origin_of([LAYOUT, asdict(levels), seed, per_approach, list(sites)])
     path = folder / f"windows-{origin}.csv"
     if not path.is_file():
-        # Apart from the seeds that recordings are made with: no window is one of a tested recording.
+        # Different from the seeds of the recordings: no window is from a test recording.
         apart = int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])
         windows, _ = simulated_window_pair(
             per_approach, apart, sites=sites, jobs=jobs, levels=levels, progress=progress
         )
         write_features(path, windows)
-    # Rendered at a quarter of the rate, with the bins of the full one: the feature is that of OVAD's array.
+    # Rendered at a quarter of the rate but with the bins of the full rate: the feature is that of OVAD's
+    # array.
     table = replace(read_features(path), domain=ovad_domain(sites))
     return table, f"{len(table)} simulated windows of the same junctions, other recordings"
 
@@ -234,11 +235,11 @@ def windows_from_simulation(
 def model_from_windows(windows: FeatureTable, folder: Path, seed: int) -> Path:
     """Train this library's model on the windows of a standing ego, and return its file.
 
-    The paper's sweep over camera states listens with a classifier that knows the junctions; the model that
-    ships has heard other ones.
+    In the paper's sweep over camera states the classifier is trained on the same junctions; the shipped model
+    is trained on other ones.
     """
     table = windows.group("static")
-    # Beside the numbers, what each row is told to be.
+    # Labels, recordings and domain of the rows; their numbers are added below.
     told = [table.labels.tolist(), table.recording_keys.tolist(), encode(table.domain)]
     path = folder / f"trained-{origin_of([VERSION, seed, told, table.features.tolist()])}.json"
     if not path.is_file():

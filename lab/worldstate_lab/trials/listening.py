@@ -1,4 +1,4 @@
-"""Passes over the sound of one recording: what the front-end reads, and what the whole chain says."""
+"""Passes over the sound of one recording: values of the front-end, and decisions of the whole chain."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -49,40 +49,40 @@ from .trial import (
     Take,
 )
 
-# Changes whenever a pass over the same recording would give other numbers.
+# Increased whenever a pass over the same recording would give different numbers.
 VERSION = 6
-# How the library listens: at its first guess of the site, and learning the site.
+# Two settings of the library: with the initial reference of the site, and with a reference that is learned.
 CHAINS = {
     "plain": ListenSettings(site_adaptation=False),
     "adapted": ListenSettings(),
 }
-# The grounded likelihood without its approach rate, for the ablation that drops it.
+# The grounded likelihood without its approach rate, for an ablation.
 RATELESS = Grounding(settings=GroundedSettings(without=frozenset({"radial_speed_m_s", "inverse_tta_hz"})))
 SIDES = {"left": LEFT, "right": RIGHT}
-# An entity counts as a track where it more likely exists than not.
+# An entity counts as a track if its existence probability is above this value.
 LIKELY = 0.5
-# The paper asks a usable tone for harmonics that agree: one line alone proves nothing.
+# In the paper a usable tone needs harmonics that agree; a single line is not sufficient.
 LEAST_PARTIALS = 2
-# The tone of a pass-by is looked for this long around line-of-sight entry, so that a stream of an hour is
-# not read into memory for it.
+# The tone of a pass-by is searched for within this time of line-of-sight entry, so that a stream of one hour
+# is not read into memory.
 AROUND_S = 15.0
-# Vehicles move evenly over a second: the tangent of the azimuth is a straight line over so many images.
+# Speed is nearly constant over a second: the tangent of the azimuth is linear in time over this many images.
 LAST_IMAGES, LONGEST_FORECAST_S = 10, 5.0
 
 
 class _Silent:
-    """A classifier that favours nothing: the features are classified later."""
+    """A classifier with constant output: the features are classified later."""
 
     def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
         return SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 
 
 def front_end_tables(take: Take) -> dict[str, HopTable]:
-    """Return `hops`, `boxes` and `truth` of a recording, as a `Trial` has them; no model is asked.
+    """Return `hops`, `boxes` and `truth` of a recording in the format of a `Trial`; no model is used.
 
-    `hops` has an `approach` score and a `log_slope_hz` of looming, `srp_rad` and `music_rad` beside the
-    `reference_rad` of the camera's moving box; `about` says when the vehicle passes and why the tone of the
-    pass-by cannot be used, if so.
+    `hops` has an `approach` score, `log_slope_hz` of looming, and `srp_rad` and `music_rad` with the
+    `reference_rad` of the camera's moving box. `about` contains the time of the pass and, if the tone of the
+    pass-by cannot be used, the reason.
     """
     source = open_source(take.path, settings=ListenSettings(uncalibrated=True))
     vision = source.camera_channel()
@@ -117,8 +117,9 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
 
 
 def model_refusal(take: Take, model: Model) -> str | None:
-    """Say why a model was not made for the sound of a recording; None where it was, or names no array."""
-    # Listened to uncalibrated it has no sequence, but nothing is refused before it can be said here.
+    """Return why a model does not fit the sound of a recording; None if it does, or specifies no array."""
+    # Uncalibrated, the chain has no sequence model, but no error is raised before the reason is returned
+    # here.
     source = open_source(take.path, model=model, settings=replace(CHAINS["plain"], uncalibrated=True))
     domain = model.domain
     if domain is None:
@@ -133,7 +134,7 @@ def model_refusal(take: Take, model: Model) -> str | None:
 
 
 def chain_tables(take: Take, chain: str, model: Path | None = None) -> dict[str, HopTable]:
-    """Return what the whole chain said of a recording: `decisions`, `tracks` and its hop `stream`."""
+    """Return the results of the whole chain on a recording: `decisions`, `tracks` and its hop `stream`."""
     source = open_source(take.path, model=model, settings=CHAINS[chain])
     return tables_of_steps(take.name, listen_steps(source))
 
@@ -159,19 +160,19 @@ def tables_of_steps(name: str, steps: Iterable[Step]) -> dict[str, HopTable]:
 
 
 def _grounded(step: Step, grounding: Grounding) -> FloatArray:
-    """Weigh the model's scores with bearing, approach rate and engine line, eq. (5)."""
+    """Weight the model's scores with bearing, approach rate and engine line, eq. (5)."""
     heard = step.measurement
     observation = observe(step.frame, heard.bearing, heard.approach)
     return grounding.answer(heard.signature, observation).evidence.log_likelihoods
 
 
 def filtered_decisions(tables: Mapping[str, HopTable]) -> Decisions:
-    """Return what the filter said, from `chain_tables`, in the form that every method answers in."""
+    """Convert the filter's results in `chain_tables` to the decisions format of all methods."""
     return Decisions(**tables["decisions"].columns, tracks=tables["tracks"])
 
 
 def unfiltered_decisions(tables: Mapping[str, HopTable], policy: CueingPolicy) -> Decisions:
-    """Return what the model's scores and its policy say, hop by hop, without the filter behind them."""
+    """Return the decisions of the model's scores and its policy, hop by hop, without the filter."""
     stream = tables["stream"]
     score = stream_statistic(stream, policy.reference_prior)
     left, right = stream.log_likelihoods[:, 0], stream.log_likelihoods[:, 1]
@@ -185,9 +186,10 @@ def unfiltered_decisions(tables: Mapping[str, HopTable], policy: CueingPolicy) -
 
 
 def pass_time_s(truth: HopTable) -> float | None:
-    """Return when the first vehicle crosses the ego's axis; None where that cannot be told.
+    """Return when the first vehicle crosses the ego's axis; None if it cannot be determined.
 
-    Beyond the last image the tangent of its azimuth, which is linear in time at constant speed, is extended.
+    After the last image, the tangent of its azimuth, which is linear in time at constant speed, is
+    extrapolated.
     """
     chosen = truth.vehicle == 0 if len(truth) else np.zeros(0, bool)
     time_s, azimuth = truth.time_s[chosen], truth.azimuth_rad[chosen]
@@ -205,18 +207,19 @@ def pass_time_s(truth: HopTable) -> float | None:
 
 
 def frame_row(frame: AcousticFrame) -> tuple[Any, ...]:
-    """Keep of a hop what methods read, so that an hour of sound stays within some ten megabytes."""
+    """Return the values of a hop that methods use, so that an hour of sound needs only about 10 MB."""
     slope = np.nan if isinstance(frame.looming, NotUsable) else frame.looming.log_slope_hz
-    # Of the decision window, not of the shorter one that the bearing is read from: the paper's prominence.
+    # Of the decision window and not of the shorter window of the bearing: the paper's prominence.
     median = float(np.median(frame.srp))
-    prominence = float(frame.srp.max()) / median if median else 1.0  # Nothing was heard
+    prominence = float(frame.srp.max()) / median if median else 1.0  # No sound
     return frame.feature, prominence, slope, frame.bearing_rad
 
 
 def _decided(state: WorldState) -> tuple[Any, ...]:
     raised = [cue for cue in state.cues if cue.advisory]
     told = max(raised or state.cues, key=lambda cue: cue.risk, default=None)
-    # What is held against the threshold, as a probability: another threshold would have raised by it.
+    # The value that the alarm compares with its threshold, as a probability: with another threshold, it would
+    # decide.
     nats = max((cue.evidence.compared_nats for cue in state.cues if cue.evidence), default=np.nan)
     score = 1.0 / (1.0 + np.exp(-nats))
     side = SIDES.get(told.direction or "", NO_SIDE) if raised and told is not None else NO_SIDE
@@ -224,15 +227,16 @@ def _decided(state: WorldState) -> tuple[Any, ...]:
 
 
 def _bearing(state: WorldState) -> float:
-    """Return the azimuth of the moving entity that most likely exists, NaN where none likely does."""
-    # Not that of a cue: a vehicle in view leaves both hidden sides at a risk of nothing, at 55 degrees.
+    """Return the azimuth of the moving entity with the highest existence probability, NaN if none exists."""
+    # Not the azimuth of a cue: with a vehicle in view, both hidden sides have a negligible risk, at 55
+    # degrees.
     likely = [one for one in state.entities if one.moving and one.existence_probability >= LIKELY]
     strongest = max(likely, key=lambda one: one.existence_probability, default=None)
     return np.nan if strongest is None else strongest.azimuth_rad
 
 
 def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
-    """Return the stated time to visible; a cue names no interval."""
+    """Return the predicted time to visible with its interval; NaN if there is none."""
     horizon_s = None if cue is None else cue.horizon_s
     return (np.nan, np.nan if horizon_s is None else horizon_s, np.nan)
 
@@ -258,7 +262,7 @@ def box_table(source: Source, vision: VisionQuery) -> HopTable:
 
 
 def _truth(take: Take, boxes: HopTable) -> HopTable:
-    """Return the simulation's tracks, or the widest moving box of each image where nothing else is known."""
+    """Return the simulation's tracks, or the widest moving box of each image if there is no other truth."""
     rows: list[tuple[float, int, float, bool]] = []
     for vehicle, track in enumerate(read_true_tracks(take.path)):
         moments = zip(track.time_s, track.azimuth_rad, track.in_view, strict=True)
@@ -269,7 +273,7 @@ def _truth(take: Take, boxes: HopTable) -> HopTable:
 
 
 def widest_moving(boxes: HopTable) -> list[tuple[float, int, float, bool]]:
-    """Return where the widest moving box of each image stands, as rows of the truth of a trial."""
+    """Return the azimuth of the widest moving box of each image, as rows of the truth of a trial."""
     widest: dict[float, tuple[float, float]] = {}
     for i in np.flatnonzero(boxes.moving):
         width = float(boxes.box_px[i, 2] - boxes.box_px[i, 0])
@@ -279,15 +283,15 @@ def widest_moving(boxes: HopTable) -> list[tuple[float, int, float, bool]]:
 
 
 def reference_rad(frame: AcousticFrame, vision: VisionQuery) -> float:
-    """Azimuth of the moving box that is nearest to the acoustic bearing, NaN without one."""
-    # Half a camera period on: the image nearest in time to the middle of the bearing's window.
+    """Return the azimuth of the moving box nearest to the acoustic bearing, NaN if there is none."""
+    # Half a camera period later: the image nearest in time to the centre of the bearing's window.
     stamp = nanoseconds(seconds(frame.stamp_ns) - frame.bearing_age_s + 0.5 * HOP_S)
     moving = [seen.azimuth_rad for seen in vision.sightings(stamp) if seen.moving]
     return min(moving, key=lambda azimuth: abs(azimuth - frame.bearing_rad), default=np.nan)
 
 
 def _doppler(audio: AudioSource, array: MicrophoneArray, t0_s: float) -> str:
-    """Why the tone of the pass-by cannot be used, at the microphone nearest to the centre; else nothing."""
+    """Return why the tone of the pass-by cannot be used at the microphone nearest to the centre, or ""."""
     middle = int(np.argmin(np.linalg.norm(array.centred_m, axis=1)))
     rate = audio.sample_rate_hz
     first = round(max(t0_s - AROUND_S, 0.0) * rate)
@@ -300,7 +304,7 @@ def _doppler(audio: AudioSource, array: MicrophoneArray, t0_s: float) -> str:
 def _music(
     audio: AudioSource, array: MicrophoneArray, frames: Iterable[AcousticFrame], wanted: BoolArray
 ) -> FloatArray:
-    """MUSIC bearings of the very samples that the SRP bearings were read from, NaN where not wanted."""
+    """Return MUSIC bearings from the samples of the SRP bearings, NaN for hops without a request."""
     rate = audio.sample_rate_hz
     chosen = FrontEndSettings(nfft=feature_nfft(rate))
     bins = band_bins(chosen.srp_band_hz, rate, chosen.nfft)

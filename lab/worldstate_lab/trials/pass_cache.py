@@ -1,7 +1,6 @@
-"""From recordings to trials: every pass over the sound, its results kept by the content of what made them.
+"""From recordings to trials: passes over the sound, with results cached by the content of their inputs.
 
-The same work over recordings is done on processes of this machine; what comes out does not depend on how
-many.
+The work is distributed over processes of this machine; results do not depend on their number.
 """
 
 import hashlib
@@ -37,25 +36,25 @@ from .trial import DECISION_COLUMNS, Decisions, Take, Trial
 
 
 def origin_of(made_of: object) -> str:
-    """Return 32 characters that change whenever anything of JSON-able values does.
+    """Return a hash of 32 characters of JSON-compatible values.
 
     Examples
     --------
     >>> origin_of({"seed": 1}) == origin_of({"seed": 1}), origin_of({"seed": 1}) == origin_of({"seed": 2})
     (True, False)
     """
-    # 128 bits: two of a million files get the same name with a probability of 1e-27.
+    # 128 bits: two of a million files have the same hash with a probability of 1e-27.
     return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:32]
 
 
-# What a pass reads of a recording. Other files in its folder, such as notes of its owner, change nothing.
+# Files that a pass reads. Other files in the folder, such as notes, do not change its fingerprint.
 RECORDING_NAMES = (AUDIO_NAME, *DETECTION_NAMES, VIDEO_NAME, TRUTH_NAME)
 
 
 def fingerprint(place: Path, memo: Path) -> str:
-    """Name the content of a recording, a folder in OVAD's layout or one file, in 32 characters.
+    """Return a hash of 32 characters of a recording's content, a folder in OVAD's layout or one file.
 
-    Hashes of files by path, size, time of change and inode are kept in the folder `memo`.
+    Hashes of files by path, size, change time and inode are stored in the folder `memo`.
 
     Examples
     --------
@@ -77,8 +76,8 @@ def fingerprint(place: Path, memo: Path) -> str:
 
 
 def _hashes(memo: Path, owner: Path, files: list[Path]) -> dict[str, str]:
-    """Return the hash of each file by name; those that did not change are not read again."""
-    # One file for all recordings would lose entries where two processes write it at once.
+    """Return the hash of each file by name; unchanged files are not read again."""
+    # With one file for all recordings, entries would be lost if two processes wrote it at once.
     path = memo / f"{origin_of(str(owner.absolute()))}.json"
     known = _known(path)
     stamps = {file: _stamp(file) for file in files}
@@ -90,7 +89,7 @@ def _hashes(memo: Path, owner: Path, files: list[Path]) -> dict[str, str]:
 
 
 def _known(path: Path) -> dict[str, str]:
-    # A damaged memory costs one more reading of the files, nothing else.
+    # A damaged memo file only means that the sound files are read again.
     try:
         read = json.loads(path.read_bytes())
     except (OSError, ValueError):
@@ -99,22 +98,22 @@ def _known(path: Path) -> dict[str, str]:
 
 
 def _stamp(path: Path) -> str:
-    # Taken before the file is read: one that changes meanwhile has another stamp, and is read again.
-    # The time of the last writing can be set by anyone who copies, that of the change of the inode cannot.
+    # Taken before the file is read: if the file changes in the meantime, its stamp differs and it is read
+    # again. Copying may set the modification time, but not the change time of the inode.
     state = path.stat()
     return f"{path.name} {state.st_size} {state.st_mtime_ns} {state.st_ctime_ns} {state.st_ino}"
 
 
 def content_hash(path: Path) -> str:
-    """Name the content of a file in 32 characters."""
-    # In blocks of 256 KiB: 11 GB of sound never sit in memory.
+    """Return a hash of 32 characters of a file's content."""
+    # In blocks of 256 KiB, because files have up to 11 GB.
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class PassCache:
-    """Tables by name of each pass over a recording, in files below `folder`; may be sent to other processes.
+    """Cache of the tables of each pass over a recording, in files below `folder`; it can be pickled.
 
     Examples
     --------
@@ -131,21 +130,21 @@ class PassCache:
     def tables(
         self, pass_name: str, key: object, make: Callable[[], Mapping[str, HopTable]]
     ) -> Mapping[str, HopTable]:
-        """Return what `make` gave for this `key`, anything ready for JSON that the tables depend on."""
+        """Return the result of `make` for this `key`, the JSON-compatible inputs of the tables."""
         path = self.folder / pass_name / f"{origin_of(key)}.npz"
         sealed = path.with_suffix(".sum")
-        # Killed between the two, a run has not finished writing.
+        # Both files must exist: a run may have been killed after it wrote the first.
         if path.is_file() and sealed.is_file():
             try:
                 _check_seal(path, sealed)
                 return load_named(path, "tables of a pass")
             except InputFileError as error:
-                warnings.warn(f"{error}; made again", stacklevel=2)
+                warnings.warn(f"{error}; computed again", stacklevel=2)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_named(path, make())
         write_text(sealed, _seal(path))
-        # As read, also where just made: JSON makes lists of tuples in `about`, and an interrupted run that
-        # goes on shall give what an uninterrupted one does.
+        # Read back even if just written: JSON converts tuples in `about` to lists, and a resumed run must
+        # give the same values as an uninterrupted one.
         return load_named(path, "tables of a pass")
 
 
@@ -154,9 +153,9 @@ def _seal(path: Path) -> str:
 
 
 def _check_seal(path: Path, sealed: Path) -> None:
-    """Refuse tables that are not those that were written under this name: they may read all the same."""
+    """Raise an error if tables are not those written under this name, even if they are readable."""
     if sealed.read_bytes() != _seal(path).encode():
-        raise InputFileError(path, f"expected what {sealed.name} was written for")
+        raise InputFileError(path, f"expected the content recorded in {sealed.name}")
 
 
 Item = TypeVar("Item")
@@ -165,19 +164,19 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """What stands in the place of the result of a recording that could not be read."""
+    """Result for a recording that could not be read."""
 
-    name: str  # Of the recording
+    name: str  # Name of the recording
     problem: str  # Text of the error
 
 
 def attempted(
     work: Callable[[Item], Result], items: Sequence[Item], jobs: int, name: Callable[[Item], str] = str
 ) -> Generator[Result | Failed, None, None]:
-    """Yield ``work(item)`` in the order of the items; one that fails is reported and the others go on.
+    """Yield ``work(item)`` in the order of the items; if one fails, it is reported and the others continue.
 
-    `work` is sent to other processes with the items: paths and settings, never sound. Errors of programs,
-    which would meet every recording, are raised.
+    `work` is sent to other processes with the items: paths and settings, never sound. Programming errors,
+    which would affect every recording, are raised.
 
     Examples
     --------
@@ -190,7 +189,7 @@ def attempted(
 
 
 def _attempt(work: Callable[[Item], Result], named: tuple[str, Item]) -> Result | Failed:
-    """Do the work on one BLAS thread, here as on every worker: sums of two threads differ in the last bit."""
+    """Do the work on one BLAS thread in every process: sums over two threads differ in the last bit."""
     name, item = named
     try:
         with one_blas_thread():
@@ -200,25 +199,25 @@ def _attempt(work: Callable[[Item], Result], named: tuple[str, Item]) -> Result 
 
 
 ALPHA = 0.02
-# Streams are cut into pieces of this length, dealt to folds in their order: a threshold is then set on other
-# minutes of the same stream, and an alarm that lasts over a cut counts once more.
+# Streams are cut into pieces of this length, which are assigned to folds in order. A threshold is then set on
+# other minutes of the same stream. An alarm that continues across a cut counts twice.
 PIECE_S = 60.0
-# What a model says of a recording that it was made for: decisions of whole chains, and scores by hop.
+# Results that need a model for this sound: decisions of whole chains, and scores by hop.
 CHAIN_NAMES = ("shipped", "adapted", "filtered")
 SCORES = ("shipped", "grounded", "rateless")
 
 
 @dataclass(frozen=True, slots=True)
 class Hearer:
-    """How recordings are heard, and where what was heard is kept."""
+    """Processes recordings with the given settings and caches the results."""
 
     folder: Path
-    model: Path | None = None  # Model file of the chains; the one that ships where not given
+    model: Path | None = None  # Model file of the chains; by default the shipped one
 
     def __call__(self, take: Take) -> Trial:
-        """Listen to one recording, or read back what an earlier run heard of the same content."""
+        """Process one recording, or read the cached results for the same content."""
         mark = fingerprint(take.path, self.folder / "fingerprints")
-        # What ships for a moving ego is another model, and its chains hear with that.
+        # The shipped model for a moving ego is another one, and its chains use it.
         model = read_model(self.model, moving_ego=take.moving)
         array = named_array(take.path)
         about = [VERSION, take.name, take.label, take.t0_s, take.site, mark]
@@ -231,7 +230,7 @@ class Hearer:
             unasked = (*CHAIN_NAMES, *SCORES)
             told = {**hops.about, "refused": dict.fromkeys(unasked, refused)}
             return Trial(hops.replace(about=told), heard["boxes"], heard["truth"])
-        # What the chains say depends on the model, too, which the shipped one may change with a release.
+        # Results of the chains depend on the model too, and the shipped one may change with a release.
         signed = [*about, origin_of(encode(model))]
         said = {
             chain: cache.tables(chain, signed, partial(chain_tables, take, chain, self.model))
@@ -255,7 +254,7 @@ class Hearer:
 
 
 def hear(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
-    """Return the trials in the order of the recordings, cut to pieces, and what cannot be read."""
+    """Return the trials in the order of the recordings, cut into pieces, and the failed recordings."""
     trials: list[Trial] = []
     failed: list[Failed] = []
     for found in heard:
@@ -267,7 +266,7 @@ def hear(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
 
 
 def within_hours(trials: Sequence[Trial], hours: float | None) -> list[Trial]:
-    """Keep all approaches, and hazard-free recordings in their order until they make up so many hours."""
+    """Keep all approaches, and hazard-free recordings in order until their total reaches these hours."""
     if hours is None:
         return list(trials)
     kept, left_s = [], hours * 3600.0
@@ -279,14 +278,14 @@ def within_hours(trials: Sequence[Trial], hours: float | None) -> list[Trial]:
     if left_s > 1e-9:
         have = hours - left_s / 3600.0
         raise InvalidArgumentError(
-            f"--hazard-free-hours: expected at most the {have:.4g} h at hand, got {hours:g}; "
-            "give more with --hazard-free"
+            f"--hazard-free-hours: expected at most the available {have:.4g} h, got {hours:g}; "
+            "add more with --hazard-free"
         )
     return kept
 
 
 def scored_s(trial: Trial) -> float:
-    """Return the time that is scored: one hop a decision."""
+    """Return the scored time: one hop per decision."""
     return len(trial.hops) * HOP_S
 
 
@@ -329,5 +328,5 @@ def _cut(said: Decisions, inside: Inside) -> Decisions:
 
 
 def data_fingerprint(trials: Sequence[Trial]) -> str:
-    """Name the content of all recordings of an evaluation in 32 characters."""
+    """Return a hash of 32 characters of the content of all recordings of an evaluation."""
     return origin_of(sorted((trial.name, trial.hops.about["fingerprint"]) for trial in trials))

@@ -1,6 +1,6 @@
-"""What every method is given of a recording, and what it answers.
+"""Input and output of every method: trials and decisions.
 
-The recordings of an evaluation are tested, learned from, or missing.
+A recording of an evaluation is used for test or for training, or is missing.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,17 +26,17 @@ from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.stream.truth import stream_hazards
 
 LEFT, RIGHT, NO_SIDE = 1, -1, 0
-# The columns of the tables of a trial and of an answer.
+# Columns of the tables of a trial and of decisions.
 BOX_COLUMNS = ("frame", "time_s", "box_px", "score", "class_name", "azimuth_rad", "moving")
 TRUTH_COLUMNS = ("time_s", "vehicle", "azimuth_rad", "in_view")
 TRACK_COLUMNS = ("time_s", "track", "azimuth_rad")
-# One value a hop each, in the order of `Decisions`.
+# One value per hop each, in the order of `Decisions`.
 DECISION_COLUMNS = ("time_s", "alarm", "side", "bearing_rad", "score", "risk", "visible_s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decisions:
-    """What one method said of one recording, hop by hop.
+    """Decisions of one method on one recording, hop by hop.
 
     Parameters
     ----------
@@ -45,17 +45,17 @@ class Decisions:
     alarm : ndarray of bool, shape (n,)
         Whether an advisory is on.
     side : ndarray of int, shape (n,)
-        1 left, -1 right, 0 where the method names none.
+        1 left, -1 right, 0 if the method gives none.
     bearing_rad : ndarray, shape (n,)
-        Left positive; NaN where the method states none.
+        Left positive; NaN if the method gives none.
     score, risk : ndarray, shape (n,)
-        The statistic that is thresholded, and the calibrated probability; NaN where a method has none.
+        The thresholded statistic, and the calibrated probability; NaN if the method has none.
     visible_s : ndarray, shape (n, 3)
-        Stated time to visible: low end, best value and high end of its interval; NaN where not stated.
+        Predicted time to visible: lower bound, best value and upper bound; NaN if there is none.
     tracks : HopTable
-        One row a hop and track: `time_s`, `track` (a number that names the identity), `azimuth_rad`.
+        One row per hop and track: `time_s`, `track` (a number, its identity), `azimuth_rad`.
     threshold : ndarray, shape (1,) or (0,)
-        What the score is held against, if a method holds it against anything.
+        Threshold of the score, if the method has one.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class Decisions:
 
     @classmethod
     def of(cls, time_s: FloatArray, alarm: BoolArray, **stated: Any) -> "Decisions":
-        """Return the decisions of a method that states only some of the columns."""
+        """Return the decisions of a method that gives only some of the columns."""
         n = len(time_s)
         unknown = dict.fromkeys(("bearing_rad", "score", "risk"), np.full(n, np.nan))
         columns = {"side": np.zeros(n, np.int64), "visible_s": np.full((n, 3), np.nan), **unknown}
@@ -88,24 +88,24 @@ class Decisions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One recording as every method is given it.
+    """One recording in the form that every method receives.
 
     Parameters
     ----------
     hops : HopTable
-        What the front-end read, one row a decision of 0.1 s: `time_s`, `features` (n, 60), `srp_rad`,
+        Values of the front-end, one row per decision of 0.1 s: `time_s`, `features` (n, 60), `srp_rad`,
         `prominence`, `log_slope_hz` of looming, the camera's `answer`, `miss_rate` and `clutter_rate`, and
-        the reference `reference_rad` of a moving box in view. Name, label and T0 are the recording's;
-        `about` holds its `site`, whether the ego moves, and by what the model was not asked, why it was not
-        made for this sound (`refused`).
+        the reference `reference_rad` of a moving box in view. Name, label and T0 are the recording's.
+        `about` contains its `site`, whether the ego moves, and `refused`: by chain or score, why its model
+        does not fit this sound.
     boxes : HopTable
-        What the camera reported, one row a box: `frame`, `time_s`, `box_px` (n, 4) as x1, y1, x2, y2,
-        `score`, `class_name`, `azimuth_rad` of its middle, `moving`; no rows where there is no camera.
+        Detections of the camera, one row per box: `frame`, `time_s`, `box_px` (n, 4) as x1, y1, x2, y2,
+        `score`, `class_name`, `azimuth_rad` of its centre, `moving`; no rows if there is no camera.
     truth : HopTable
-        Where the vehicles were, one row a camera frame and vehicle: `time_s`, `vehicle`, `azimuth_rad`,
-        `in_view`. Of a real recording these are the moving boxes, all in view.
+        True positions of the vehicles, one row per camera frame and vehicle: `time_s`, `vehicle`,
+        `azimuth_rad`, `in_view`. In a real recording these are the moving boxes, all in view.
     chains : mapping of str to Decisions
-        What the whole library said, by variant; see `listening.CHAINS`.
+        Decisions of the whole library, by variant; see `listening.CHAINS`.
 
     Examples
     --------
@@ -122,27 +122,27 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Of the recording."""
+        """Name of the recording."""
         return self.hops.name
 
     @property
     def label(self) -> str:
-        """Side that the vehicle comes from, or "none"."""
+        """Side from which the vehicle comes, or "none"."""
         return self.hops.label
 
     @property
     def hazard_free(self) -> bool:
-        """Whether nothing approaches."""
+        """Whether the recording contains no approach."""
         return self.hops.hazard_free
 
     @property
     def t0_s(self) -> float:
-        """Line-of-sight entry, seconds; NaN without one."""
+        """Line-of-sight entry, seconds; NaN if there is none."""
         return self.hops.t0_s
 
     @property
     def refused(self) -> Mapping[str, str]:
-        """By chain or score that the model was not asked for: why it was not made for this sound."""
+        """By chain or score that is missing: why the model does not fit this sound."""
         return dict(self.hops.about.get("refused", {}))
 
     @property
@@ -151,12 +151,12 @@ class Trial:
         return str(self.hops.about["site"])
 
 
-# A method that was fitted to the calibration recordings: from one trial to what it says of it.
+# A method after its fit to the calibration recordings: maps a trial to decisions.
 Decide = Callable[[Trial], Decisions]
 
 
 class Method(Protocol):
-    """One row of Table I: fitted to the calibration recordings, then asked about the others.
+    """One row of Table I: fitted to the calibration recordings, then applied to the others.
 
     Examples
     --------
@@ -172,24 +172,24 @@ class Method(Protocol):
 
     @property
     def name(self) -> str:
-        """As in the report."""
+        """Name in the report."""
         ...
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
-        """Set thresholds and maps on recordings none of which is asked about afterwards."""
+        """Set thresholds and maps on the calibration recordings, which are never test recordings."""
         ...
 
 
-# The official lists of test recordings, beside the log or in the folder that they are released in.
+# The official lists of test recordings, beside the log or in the folder of their release.
 STATIC_LIST, DYNAMIC_LIST = "timeHorizonStaticTestset.csv", "timeHorizonDynamicTestset.csv"
 LIST_FOLDERS = ("", "config")
-# So many missing files are named; of the others the number is said.
+# Maximum number of missing files that an error message lists.
 NAMED = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Take:
-    """One recording to be heard.
+    """One recording to be processed.
 
     Examples
     --------
@@ -199,14 +199,14 @@ class Take:
 
     path: Path  # Recording folder in OVAD's layout, or a sound file
     name: str  # Unique in an evaluation
-    site: str  # Such as "SA1"; for a stream the name of its file
-    label: str = "none"  # Side that a vehicle comes from
+    site: str  # Such as "SA1"; for a stream its file name
+    label: str = "none"  # Side from which a vehicle comes
     t0_s: float | None = None  # Line-of-sight entry, seconds
     moving: bool = False  # Whether the ego moves
 
     @classmethod
     def of(cls, recording: Recording) -> "Take":
-        """Return a recording of a data set."""
+        """Return the take of a recording in a data set."""
         label, site = recording.label or "none", recording.environment or "?"
         return cls(
             recording.path, recording.recording_id, site, label, recording.t0_s, bool(recording.moving_ego)
@@ -214,33 +214,33 @@ class Take:
 
     @property
     def hazard_free(self) -> bool:
-        """Whether nothing approaches."""
+        """Whether the recording contains no approach."""
         return self.label == "none"
 
     @property
     def filmed(self) -> bool:
-        """Whether a video lies beside the sound."""
+        """Whether there is a video beside the sound."""
         return (self.path / VIDEO_NAME).is_file()
 
 
 @dataclass(frozen=True, slots=True)
 class TakeList:
-    """What an evaluation runs on."""
+    """The recordings of an evaluation."""
 
     root: Path
     static: tuple[Take, ...]  # Test recordings of a standing ego, streams included
-    dynamic: tuple[Take, ...]  # Of a moving one
-    training: tuple[Take, ...]  # Other recordings of the data set: nothing is tested on them
+    dynamic: tuple[Take, ...]  # Test recordings of a moving ego
+    training: tuple[Take, ...]  # Other recordings of the data set, which are not tested
     official: bool  # Whether the test recordings are those of the official lists
 
     @property
     def simulated(self) -> bool:
-        """Whether the recordings are simulated ones."""
+        """Whether the recordings are simulated."""
         return any((take.path / TRUTH_NAME).is_file() for take in (*self.static, *self.dynamic))
 
     @property
     def origin(self) -> str:
-        """What was evaluated, for the first line of the report."""
+        """Description of the data, for the first line of the report."""
         kind = "SIMULATED streets" if self.simulated else "Recordings given"
         split = ", official test recordings" if self.official else ""
         return f"{kind}, folder {self.root.name}{split}"
@@ -253,10 +253,11 @@ def find_takes(
     dynamic_ids: Path | None = None,
     hazard_free: Sequence[Path] = (),
 ) -> TakeList:
-    """Find the recordings of a data set in OVAD's layout, and refuse one of which anything is missing.
+    """Find the recordings of a data set in OVAD's layout; raise an error if any data are missing.
 
-    The tested ones are those of the lists given, else of the official lists where they lie in the folder,
-    else all. `hazard_free` adds recordings, data sets or sound files of any length without a vehicle.
+    Test recordings are those in the given lists, otherwise those in the official lists if the folder contains
+    them, otherwise all. `hazard_free` adds recordings, data sets or sound files of any length without a
+    vehicle.
     """
     if not (root / LOG_NAME).is_file():
         raise InputFileError(root, f"expected a data set in OVAD's layout, with {LOG_NAME}; {_found(root)}")
@@ -268,7 +269,7 @@ def find_takes(
     others: list[Recording] = []
     for recording in recordings:
         ids = wanted[bool(recording.moving_ego)]
-        # With one list only, the recordings of the other kind are tested as well.
+        # With one list only, the recordings of the other kind are test recordings too.
         inside = ids is None or recording.recording_id in ids
         (tested[bool(recording.moving_ego)] if inside else others).append(recording)
     listed = {recording.recording_id for recording in recordings}
@@ -278,7 +279,7 @@ def find_takes(
     if problems:
         more = f"\n  and {len(problems) - NAMED} more" if len(problems) > NAMED else ""
         shown = "".join(f"\n  {problem}" for problem in problems[:NAMED])
-        raise InputFileError(root, f"{len(problems)} things are missing:{shown}{more}")
+        raise InputFileError(root, f"{len(problems)} required items are missing:{shown}{more}")
     streams = [take for path in hazard_free for take in _hazard_free(path)]
     takes = {moving: tuple(map(Take.of, found)) for moving, found in tested.items()}
     return TakeList(root, (*takes[False], *streams), takes[True], tuple(map(Take.of, others)), official)
@@ -296,7 +297,7 @@ def _found(root: Path) -> str:
 
 
 def _missing(recordings: Iterable[Recording]) -> list[str]:
-    """Name what an evaluation of these recordings needs and does not find."""
+    """Return the missing data that an evaluation of these recordings needs."""
     problems = []
     for recording in recordings:
         where = f"{recording.environment}/{recording.label}/{recording.recording_id}"
@@ -305,7 +306,7 @@ def _missing(recordings: Iterable[Recording]) -> list[str]:
             continue
         if not recording.audio_path.is_file():
             problems.append(f"{where}/{AUDIO_NAME}")
-        # A moving ego's detections are of no use: from a moving camera every box moves.
+        # Detections of a moving ego cannot be used: with a moving camera every box moves.
         if not recording.moving_ego and recording.detections_path is None:
             problems.append(f"{where}/{DETECTION_NAMES[0]}")
         if recording.label != "none" and recording.t0_s is None:
@@ -329,7 +330,7 @@ def _hazard_free(path: Path) -> list[Take]:
 
 
 def _hazard_free_stream(path: Path) -> Take:
-    """Take a stream without a label; the truth of a simulated one is looked up."""
+    """Return a stream without a label; for a simulated one its truth file is read."""
     hazards = stream_hazards(path)
     if hazards:
         raise InputFileError(
