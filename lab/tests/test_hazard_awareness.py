@@ -226,7 +226,7 @@ def test_recordings_are_chosen_evenly_and_what_is_missing_is_named(tmp_path):
     assert few.approaches == tuple(whole[:2])
     assert few.missing == (
         f"1 of 3 approaches with video are missing: no {VIDEO_NAME} or no detections beside leftSA19",
-        "2 of 2 filmed hazard-free recordings are missing",
+        "2 of 2 hazard-free recordings with video are missing",
     )
     assert "hazard-free recordings are missing" in few.lacks
     assert chosen.lacks is None

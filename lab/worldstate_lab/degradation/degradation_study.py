@@ -67,7 +67,7 @@ def sweep_data(recordings: Sequence[Recording], approaches: int = 12, hazard_fre
     Examples
     --------
     >>> sweep_data([], approaches=2, hazard_free=0).missing
-    ('2 of 2 filmed approaches are missing',)
+    ('2 of 2 approaches with video are missing',)
     """
     of_kind = [[one for one in recordings if (one.label == "none") == free] for free in (False, True)]
     names = "approaches", "hazard-free recordings"
@@ -279,7 +279,7 @@ def degradation_study(
     ...     degradation_study([])
     ... except InvalidArgumentError as error:
     ...     print(str(error).partition(";")[0])
-    recordings: a sweep needs 2 filmed approaches and 2 filmed hazard-free recordings
+    recordings: a sweep needs 2 approaches and 2 hazard-free recordings with video
     """
     chosen = settings or DegradationSettings()
     data = sweep_data(recordings, chosen.approaches, chosen.hazard_free)

@@ -1,1 +1,1 @@
-"""The rows of Table I and beyond, one file an idea."""
+"""The rows of Table I and further methods, one idea per file."""

@@ -1,4 +1,4 @@
-"""Rows of Table I that decide from sound: published, sustained and calibrated rules, and whole chains."""
+"""Rows of Table I with decisions from sound: published, sustained and calibrated rules, and whole chains."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from worldstate_lab.metrics.stream_statistic import StatisticSwitches, stream_st
 from worldstate_lab.trials.classification import SIDE_COLUMNS, posteriors
 from worldstate_lab.trials.trial import LEFT, RIGHT, Decide, Decisions, Trial
 
-# Every hop of k costs a tenth of a second of lead.
+# Each of the k hops costs 0.1 s of lead time.
 SUSTAIN_CHOICES = (2, 3, 4, 5)
 
 
 def argmax_is_side(trial: Trial, evidence: str) -> BoolArray:
-    """Whether the most probable class is left or right, shape (n,): the published rule."""
+    """Return whether the most probable class is left or right, shape (n,): the published rule."""
     return np.asarray(posteriors(trial, evidence).argmax(axis=1) < SIDE_COLUMNS.stop)
 
 
@@ -31,12 +31,12 @@ def likelier_side(trial: Trial, evidence: str) -> IntArray:
 
 
 def onsets_s(trial: Trial, alarm: BoolArray) -> list[float]:
-    """Return when an alarm begins, seconds."""
+    """Return the times at which an alarm begins, in seconds."""
     return [float(time_s) for time_s in trial.hops.time_s[rising_edges(alarm)]]
 
 
 def best_sustain(calibration: Sequence[Trial], evidence: str) -> int:
-    """Return the k with the largest share of approaches detected less that of quiet recordings alarmed."""
+    """Return the k with the largest share of detected approaches minus share of quiet recordings in alarm."""
     named = [(trial, argmax_is_side(trial, evidence)) for trial in calibration]
 
     def gain(hops: int) -> float:
@@ -50,7 +50,7 @@ def best_sustain(calibration: Sequence[Trial], evidence: str) -> int:
                 found.append(onset_outcome(onsets, trial.t0_s).detected)
         return _share(found) - _share(alarmed)
 
-    # Of equals the smallest: it leaves the most lead.
+    # Among equals the smallest, which gives the longest lead time.
     return max(SUSTAIN_CHOICES, key=lambda hops: (gain(hops), -hops))
 
 
@@ -73,7 +73,7 @@ def best_weight(
     weights: Sequence[float],
     statistic: Callable[[HopTable, float], FloatArray],
 ) -> float:
-    """Return the weight of looming with the largest window AUROC; of equals the smallest."""
+    """Return the weight of looming with the largest window AUROC, the smallest among equals."""
     if len(weights) == 1:
         return weights[0]
 
@@ -85,14 +85,14 @@ def best_weight(
 
 @dataclass(frozen=True, slots=True)
 class PublishedRule:
-    """Alarm where the most probable class is left or right, at once or over k hops."""
+    """Alarm if the most probable class is left or right, in one hop or in k consecutive hops."""
 
     name: str
     sustained: bool = False
-    evidence: str = "published"  # Whose posteriors: see `classification.TRAINED`
+    evidence: str = "published"  # Source of the posteriors: see `classification.TRAINED`
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
-        """Choose k where the rule is sustained; the classifier was trained beforehand."""
+        """Choose k if the rule is sustained; the classifier was trained before."""
         hops = best_sustain(calibration, self.evidence) if self.sustained else 1
 
         def decide(trial: Trial) -> Decisions:
@@ -105,24 +105,24 @@ class PublishedRule:
         return decide
 
 
-# Weights of the approach rate in nats a standard deviation; 0 leaves it out.
+# Weights of the approach rate in nats per standard deviation; 0 leaves it out.
 LOOMING_WEIGHTS = (0.0, 0.1, 0.2, 0.4, 0.8)
 
 
 @dataclass(frozen=True, slots=True)
 class CalibratedCue:
-    r"""Eq. (7): alarm where the statistic holds gamma(alpha) for k hops, set on the calibration folds.
+    r"""Eq. (7): alarm if the statistic is above gamma(alpha) for k hops, both set on the calibration folds.
 
-    Without absence the statistic is the paper's, P_left + P_right; with it the visible explanation is
-    weighed by the miss rate of the camera that was asked, eq. (6).
+    Without absence the statistic is the paper's, P_left + P_right. With absence, the visible explanation is
+    weighted by the miss rate of the queried camera, eq. (6).
     """
 
     name: str
     alpha: float
     looming: bool = False
     absence: bool = False
-    # Whose log-likelihoods: of the "published" classifier, the "ensemble", the "shipped" model, that model
-    # "grounded" by bearing and approach rate, or grounded without the rate ("rateless").
+    # Source of the log-likelihoods: the "published" classifier, the "ensemble", the "shipped" model, that
+    # model "grounded" by bearing and approach rate, or grounded without the rate ("rateless").
     evidence: str = "published"
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
@@ -156,11 +156,11 @@ class CalibratedCue:
 
 @dataclass(frozen=True, slots=True)
 class ShippedChain:
-    """One variant of the whole chain, at its model's thresholds; nothing is set on the recordings."""
+    """One variant of the whole chain with the thresholds of its model; nothing is fitted to recordings."""
 
     name: str
     chain: str
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
-        """Return what was said while listening."""
+        """Return the decisions that were made when the recording was processed."""
         return lambda trial: trial.chains[self.chain]

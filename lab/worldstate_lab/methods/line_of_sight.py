@@ -17,22 +17,22 @@ from worldstate_lab.trials.trial import TRACK_COLUMNS, Decide, Decisions, Trial
 
 from .oc_sort import MIN_SCORE, OcSort, TrackedBox
 
-# At 47,998 Hz a hop ends up to 10 us before the image that it belongs to.
+# At 47,998 Hz a hop ends up to 10 us before its image.
 SLACK_S = 1e-3
-# An image speaks until the next one is due, and half a period longer.
+# An image is valid until the next one is due, plus half a period.
 PERIODS = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Images:
-    """When the images of a trial were taken, and which of them every hop sees last."""
+    """Times of the images of a trial, and the latest image at every hop."""
 
     time_s: FloatArray  # shape (images,)
-    of_hop: IntArray  # shape (hops,): -1 where no image is recent
+    of_hop: IntArray  # shape (hops,): -1 if no image is recent
 
     @classmethod
     def of(cls, trial: Trial) -> Self:
-        """Return the images up to the last hop; none where the camera reported nothing at all.
+        """Return the images up to the last hop; none if the camera reported nothing.
 
         Examples
         --------
@@ -51,12 +51,13 @@ class Images:
         return cls(taken_s, np.where(recent, last, -1))
 
     def at_hops(self, values: FloatArray) -> FloatArray:
-        """Return what each hop sees of a value per image, NaN where it sees none."""
+        """Return the value of the latest image per hop, given one value per image; NaN without an image."""
         return np.append(values, np.nan)[self.of_hop]
 
 
 def _image_times(boxes: HopTable, until_s: float) -> FloatArray:
-    # Only images with boxes have rows: those between are interpolated, those around follow at the same rate.
+    # Only images with boxes have rows. The times between are interpolated, those outside extrapolated at the
+    # same rate.
     known, first = np.unique(boxes.frame, return_index=True)
     times = boxes.time_s[first]
     period = float(np.median(np.diff(times) / np.diff(known))) if len(known) > 1 else HOP_S
@@ -67,23 +68,23 @@ def _image_times(boxes: HopTable, until_s: float) -> FloatArray:
 
 
 def vehicles(boxes: HopTable, keep: DetectionFilter) -> BoolArray:
-    """Return which boxes count by a filter, parked or moving, shape (n,)."""
-    # The table says which boxes move, and those that do count already: only parked ones are looked up.
+    """Return which boxes a filter accepts, parked or moving, shape (n,)."""
+    # The table already marks accepted boxes that move: only parked ones must be tested.
     high = boxes.box_px[:, 3] - boxes.box_px[:, 1] > keep.min_height_px
     return np.asarray(np.isin(boxes.class_name, list(keep.labels)) & (boxes.score >= keep.min_score) & high)
 
 
 def sides(bearing_rad: FloatArray) -> IntArray:
-    """Return the side of each bearing, none where it is NaN."""
+    """Return the side of each bearing, 0 if it is NaN."""
     return np.nan_to_num(np.sign(bearing_rad)).astype(np.int64)  # Left is positive in both
 
 
 @dataclass(frozen=True, slots=True)
 class VisionOnly:
-    """An advisory at every hop whose image shows a moving vehicle; bearing and side are the widest one's."""
+    """An advisory at every hop whose image has a moving vehicle; bearing and side are of the widest box."""
 
-    # It has nothing to fit: the detector and its filter are OVAD's. What it says before T0 is the tolerance
-    # of the annotation, see `seen_early_s`; what it says of a hazard-free recording is a vehicle in view.
+    # Nothing is fitted: the detector and its filter are OVAD's. Alarms before T0 are within the tolerance of
+    # the annotation, see `seen_early_s`; alarms on hazard-free recordings are vehicles in view.
 
     name: str = "Vision-only"
 
@@ -98,7 +99,7 @@ def _seen(trial: Trial) -> Decisions:
     if len(boxes):
         moving = np.flatnonzero(boxes.moving)
         widths = boxes.box_px[moving, 2] - boxes.box_px[moving, 0]
-        # In the order of width, so that the widest box of an image is the one that stays.
+        # In order of width, so that the widest box of an image is kept.
         chosen = moving[np.argsort(widths, kind="stable")]
         azimuth[boxes.frame[chosen]] = boxes.azimuth_rad[chosen]
     bearing = images.at_hops(azimuth)
@@ -106,9 +107,9 @@ def _seen(trial: Trial) -> Decisions:
 
 
 def seen_early_s(trials: Iterable[Trial]) -> FloatArray:
-    """Return by how much the first moving box precedes T0 in each occluded approach, 0 where none does.
+    """Return the time from the first moving box to T0 in each occluded approach, 0 if none precedes T0.
 
-    The paper counts 3 of 42 such approaches, puts them down to the tolerance of the T0 annotation, and
+    The paper counts 3 of 42 such approaches, attributes them to the tolerance of the T0 annotation, and
     prints 0 in the row of vision-only.
 
     Examples
@@ -124,34 +125,34 @@ def seen_early_s(trials: Iterable[Trial]) -> FloatArray:
 
 def _early_s(trial: Trial) -> float:
     boxes = trial.boxes
-    # Before the first hop a parked car cannot be told from a moving one.
+    # Before the first hop, parked and moving cars cannot be distinguished.
     scored = boxes.time_s >= trial.hops.time_s[0] - SLACK_S
     early_s = trial.t0_s - float(boxes.time_s[scored & boxes.moving.astype(bool)].min(initial=np.inf))
-    # A box in the image of T0 itself is what T0 means.
+    # A box in the image at T0 is the definition of T0.
     return early_s if early_s > SLACK_S else 0.0
 
 
-# Field of view and range of the near scan of a common 77 GHz front radar (Continental ARS 408-21: 60 deg
-# to either side, 70 m, a scan in 72 ms); the probability is what tracking papers assume of such a radar.
-# The range decides nothing at a junction: whatever is in line of sight there is nearer than 70 m, and
-# a real recording does not say how far. Waves of 4 mm neither bend round a corner nor pass a wall; what
-# they reflect off one is clutter to a production radar, so hidden vehicles are not found at all.
+# Field of view and range of the near scan of a common 77 GHz front radar (Continental ARS 408-21: 60 deg to
+# either side, 70 m, a scan in 72 ms); the detection probability is a usual assumption for such a radar. The
+# range is irrelevant at a junction: everything in line of sight is nearer than 70 m, and real recordings
+# contain no distances. Waves of 4 mm are neither diffracted around a corner nor transmitted by a wall, and
+# production radars treat their reflections as clutter, so hidden vehicles are never detected.
 RADAR_HALF_VIEW_RAD = math.radians(60.0)
 
 
 @dataclass(frozen=True, slots=True)
 class RadarFieldOfView:
-    """A forward radar that finds a vehicle in line of sight and within its field of view, scan by scan.
+    """A forward radar that detects a vehicle in line of sight and within its field of view, scan by scan.
 
-    It raises no false alarm, so that none can be counted, and names a side only: its bearing would be the
-    true one, whose error says nothing.
+    It never raises a false alarm, so its false alarms are not scored. It gives only a side, because its
+    bearing would be the true one.
     """
 
     detection: float = 0.9
     name: str = "Radar field-of-view model"
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
-        """Return the model with the randomness of its misses: the same for a trial in every order."""
+        """Return the model with its random misses, which are the same for a trial in any order."""
         seed = int(rng.integers(1 << 32))
         return lambda trial: self._scanned(trial, seed)
 
@@ -163,7 +164,7 @@ class RadarFieldOfView:
             found &= trial.truth.in_view.astype(bool)
             found &= np.abs(trial.truth.azimuth_rad) <= RADAR_HALF_VIEW_RAD
             time_s = trial.truth.time_s[found]
-            # The first hop that ends after the scan reports it, if it is not a whole hop later.
+            # The first hop that ends after the scan reports it, if it is less than one hop later.
             hop_s = trial.hops.time_s
             hop = np.searchsorted(hop_s + SLACK_S, time_s)
             near = (hop < len(hop_s)) & (hop_s[np.minimum(hop, len(hop_s) - 1)] - time_s < HOP_S - SLACK_S)
@@ -176,32 +177,32 @@ Reading = Literal["stock", "coasting"]
 
 @dataclass(frozen=True, slots=True)
 class OcSortRecovery:
-    """An advisory while OC-SORT holds the track of a moving vehicle; bearing and side are the largest one's.
+    """An advisory while OC-SORT has the track of a moving vehicle; bearing and side are of the largest box.
 
-    In the reading `stock` a track is held while the published code emits it: in images where it has a box.
-    In `coasting` it is held for as long as the tracker keeps it, up to 3 s after its last box at 10 Hz, at
-    the place where the filter predicts it: that is what motion-model recovery can say of a hidden vehicle,
-    and it is more than the authors emit. Before T0 neither can raise an alarm on a vehicle that was never
-    seen, which is the paper's 0; on a hazard-free recording both report vehicles in view, and `coasting`
-    those that have just left it.
+    In the variant `stock` a track counts while the published code returns it, which is in images with a box.
+    In `coasting` it counts as long as the tracker keeps it, up to 3 s after its last box at 10 Hz, at the
+    position predicted by the filter. This is the most that recovery by a motion model can do for a hidden
+    vehicle, and more than the authors return. Before T0 neither variant can raise an alarm for a vehicle that
+    was never detected, which is the paper's 0. On a hazard-free recording both report vehicles in view, and
+    `coasting` also those that have just left it.
     """
 
     reading: Reading
     camera: PinholeCamera = field(default_factory=PinholeCamera.ovad)
-    keep: DetectionFilter = field(default_factory=DetectionFilter)  # Of OVAD's authors
+    keep: DetectionFilter = field(default_factory=DetectionFilter)  # The filter of OVAD's authors
 
     @property
     def name(self) -> str:
-        """As in the report."""
+        """Name in the report."""
         return f"OC-SORT recovery ({self.reading})"
 
     def fit(self, calibration: Sequence[Trial], rng: np.random.Generator, /) -> Decide:
-        """Return the tracker at its published settings: nothing is fitted."""
+        """Return the tracker with its published settings: nothing is fitted."""
         return self._decide
 
     def _decide(self, trial: Trial) -> Decisions:
         images, time_s = Images.of(trial), trial.hops.time_s
-        # A box that flashed up once never was a track to coast on.
+        # A single box is not a confirmed track and must not coast.
         counts = attrgetter("certain" if self.reading == "stock" else "known")
         held = [list(filter(counts, tracks)) for tracks in _moving_tracks(trial, images, self.keep)]
         rows = []
@@ -211,7 +212,7 @@ class OcSortRecovery:
                 azimuth = float(self.camera.azimuth(0.5 * (left + right)))
                 rows.append((hop, one.track, azimuth, (right - left) * (bottom - top)))
         bearing = np.full(len(time_s), np.nan)
-        # In the order of area, so that the largest box of a hop is the one that stays.
+        # In order of area, so that the largest box of a hop is kept.
         for hop, _, azimuth_rad, _ in sorted(rows, key=lambda row: row[3]):
             bearing[hop] = azimuth_rad
         tracks = HopTable.of_rows(TRACK_COLUMNS, [(time_s[hop], track, at) for hop, track, at, _ in rows])
@@ -221,16 +222,16 @@ class OcSortRecovery:
 
 def _moving_tracks(trial: Trial, images: Images, keep: DetectionFilter) -> Iterator[list[TrackedBox]]:
     """Yield the tracks of moving vehicles in every image."""
-    # A detector whose boxes count from a lower score would have hardly one left at the published least one.
+    # Detectors with a lower minimum score would have almost no boxes above the published one.
     sort = OcSort(min(keep.min_score, MIN_SCORE))
     boxes, moving = trial.boxes, set[int]()
-    # Parked vehicles are tracked as well and left out afterwards: given moving boxes alone, a parked car
-    # would begin a track in the first second, before it is known to stand, and coast into scored time.
+    # Parked vehicles are tracked too and left out afterwards: with moving boxes only, a parked car would
+    # start a track in the first second, before it is known to be parked, and coast into scored time.
     counted = np.flatnonzero(vehicles(boxes, keep)) if len(boxes) else np.empty(0, np.intp)
     edges = np.searchsorted(boxes.frame[counted], np.arange(len(images.time_s) + 1))
     for image, time_s in enumerate(images.time_s):
         here = counted[edges[image] : edges[image + 1]]
-        # A piece of a long stream begins long after its first image.
+        # A piece of a long stream begins long after the first image of the stream.
         tracks = (
             sort.step(boxes.box_px[here], boxes.score[here]) if time_s > trial.hops.time_s[0] - 1.5 else []
         )

@@ -1,4 +1,4 @@
-"""OC-SORT (Cao et al., CVPR 2023): tracks of boxes that trust observations more than predictions."""
+"""OC-SORT (Cao et al., CVPR 2023): a box tracker that relies on observations more than on predictions."""
 
 import math
 from dataclasses import dataclass, field
@@ -9,8 +9,8 @@ import numpy as np
 from worldstate.adapters.camera.box_linking import gated_pairs, overlaps
 from worldstate.ground.typing import FloatArray
 
-# The state of SORT (Bewley et al., 2016): middle, area and aspect ratio of a box, and how fast the first
-# three change, an image. The noises are those of its code, which every descendant has kept.
+# State of SORT (Bewley et al., 2016): centre, area and aspect ratio of a box, and the change of the first
+# three per image. The noise levels are those of its code, which all later versions have kept.
 _F = np.eye(7) + np.eye(7, k=4)
 _H = np.eye(4, 7)
 _Q = np.diag([1.0, 1.0, 1.0, 1.0, 0.01, 0.01, 0.0001])
@@ -18,27 +18,27 @@ _R = np.diag([1.0, 1.0, 10.0, 10.0])
 _P = np.diag([10.0] * 4 + [10_000.0] * 3)
 _TINY = 1e-6
 # The published settings.
-MIN_SCORE = 0.6  # Boxes below it are not looked at
-MAX_AGE = 30  # Images without a box that a track survives: 3 s at 10 Hz
-MIN_HITS = 3  # Images with a box, one after the other, that make a track certain
-MIN_IOU = 0.3  # Of a box and the one it is taken for
+MIN_SCORE = 0.6  # Boxes with a lower score are ignored
+MAX_AGE = 30  # Number of images without a box after which a track ends: 3 s at 10 Hz
+MIN_HITS = 3  # Number of consecutive images with a box that confirm a track
+MIN_IOU = 0.3  # Minimum overlap of a box with its prediction
 INERTIA = 0.2  # Weight of the direction of motion in the association
-DELTA_T = 3  # Images over which that direction is read
+DELTA_T = 3  # Number of images over which that direction is measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedBox:
-    """One living track in one image."""
+    """One live track in one image."""
 
-    track: int  # Names the identity
-    box_px: FloatArray  # The detection where it has one, else what the filter predicts
-    detection: int  # Index among the boxes of this image, -1 where the track coasts
-    certain: bool  # Whether the published code emits it now
-    known: bool  # Whether it has been certain at least once
+    track: int  # Number of the identity
+    box_px: FloatArray  # The detection if there is one, otherwise the prediction
+    detection: int  # Index among the boxes of this image, -1 if the track coasts
+    certain: bool  # Whether the published code returns it now
+    known: bool  # Whether it was confirmed at least once
 
 
 class OcSort:
-    """Boxes in, living tracks out, image by image; an image without boxes is a step, too.
+    """Tracker with boxes as input and live tracks as output; an image without boxes is a step too.
 
     Examples
     --------
@@ -58,7 +58,7 @@ class OcSort:
         self._born = self._steps = 0
 
     def step(self, boxes_px: FloatArray, scores: FloatArray) -> list[TrackedBox]:
-        """Take the boxes (n, 4) and scores (n,) of the next image."""
+        """Process the boxes (n, 4) and scores (n,) of the next image."""
         self._steps += 1
         for track in self._tracks:
             track.predict()
@@ -76,7 +76,8 @@ class OcSort:
         return [self._told(track, taken.get(track.number, -1)) for track in self._tracks]
 
     def _told(self, track: "_Track", detection: int) -> TrackedBox:
-        # The first images are exempt from the wait, or a recording would begin with a blind spot.
+        # In the first images, confirmation is not required; otherwise every recording would begin without
+        # tracks.
         early = self._steps <= MIN_HITS
         certain = detection >= 0 and (track.streak >= MIN_HITS or early)
         track.known |= certain
@@ -84,14 +85,14 @@ class OcSort:
         return TrackedBox(track.number, box, detection, certain, track.known)
 
     def _associate(self, boxes: FloatArray, scores: FloatArray) -> list[tuple[int, int]]:
-        """Return pairs of track and box: by prediction and direction first, then by the last box seen."""
+        """Return pairs of track and box, first by prediction and direction, then by the last observed box."""
         tracks = self._tracks
         predicted = np.array([track.belief.box_px for track in tracks]).reshape(-1, 4)
         overlap = overlaps(predicted, boxes)
         toward = [track.consistency(boxes) for track in tracks]
         weight = INERTIA * scores * np.array(toward).reshape(overlap.shape)
         pairs = _matched(overlap, weight)
-        # A vehicle that braked is where it was seen, not where it was predicted.
+        # A vehicle that braked is at its observed and not at its predicted position.
         idle = np.setdiff1d(np.arange(len(tracks)), [i for i, _ in pairs])
         free = np.setdiff1d(np.arange(len(boxes)), [j for _, j in pairs])
         last = np.array([tracks[i].last_px for i in idle]).reshape(-1, 4)
@@ -120,7 +121,7 @@ class _Belief:
 
     def predict(self) -> "_Belief":
         mean = self.mean.copy()
-        # An area that would vanish stops to shrink: the root of a negative one is no box.
+        # The area must not shrink to zero: a box has no size if the area is negative.
         if mean[2] + mean[6] <= 0.0:
             mean[6] = 0.0
         return _Belief(_F @ mean, _F @ self.cov @ _F.T + _Q)
@@ -141,12 +142,12 @@ class _Track:
     last_px: FloatArray
     age: int = 0  # Images since it began
     unseen: int = 0  # Images since its last box
-    streak: int = 0  # Images with a box, one after the other, the first one not counted
+    streak: int = 0  # Consecutive images with a box, without the first
     known: bool = False
-    # By age. The box that began the track is left out, as in the authors' code: a direction needs two more.
+    # By age. The first box of the track is left out, as in the authors' code: a direction needs two more.
     seen: dict[int, FloatArray] = field(default_factory=dict)
     direction: FloatArray | None = None
-    # Belief at the first image without a box: from there a gap is replayed once its end is known.
+    # Belief at the first image without a box. When the gap ends, it is replayed from there.
     frozen: _Belief | None = None
 
     @classmethod
@@ -166,7 +167,7 @@ class _Track:
             self.direction = _direction(self._earlier(), box_px)
         if self.frozen is not None:
             self.belief = self._replayed(self.frozen, box_px)
-        # As in the authors' code, the box that ends a gap counts twice: here, and in the replay before.
+        # As in the authors' code, the box that ends a gap is used twice: here, and in the replay before.
         self.belief = self.belief.update(_measured(box_px))
         self.frozen, self.unseen, self.last_px = None, 0, box_px
         self.streak += 1
@@ -174,19 +175,19 @@ class _Track:
         self.seen = {age: box for age, box in self.seen.items() if age >= self.age - DELTA_T}
 
     def consistency(self, boxes: FloatArray) -> FloatArray:
-        r"""Return :math:`(\pi/2 - \Delta\theta) / \pi`, how well each box lies in the track's direction."""
+        r"""Return :math:`(\pi/2 - \Delta\theta) / \pi`, agreement of each box with the track's direction."""
         if self.direction is None:
             return np.zeros(len(boxes))
         toward = _direction(self._earlier(), boxes)
         return np.asarray(0.5 - np.arccos(np.clip(toward @ self.direction, -1.0, 1.0)) / np.pi)
 
     def _earlier(self) -> FloatArray:
-        """Box of `DELTA_T` images ago, else the first one after it."""
+        """Return the box of `DELTA_T` images ago, or the first one after it."""
         ages = sorted(self.seen)
         return self.seen[next((age for age in ages if age >= self.age - DELTA_T), ages[-1])]
 
     def _replayed(self, belief: _Belief, box_px: FloatArray) -> _Belief:
-        """Filter the gap again along the straight line from the last box to this one, in middle and size."""
+        """Filter the gap again along the straight line from the last box to this one, in centre and size."""
         first, last = _middle_and_size(self.last_px), _middle_and_size(box_px)
         for step in range(1, self.unseen + 1):
             belief = belief.update(_shape(first + (last - first) * step / self.unseen))
@@ -210,12 +211,12 @@ def _middle_and_size(box_px: FloatArray) -> FloatArray:
 
 
 def _direction(start_px: FloatArray, end_px: FloatArray) -> FloatArray:
-    """Return the unit vectors (..., 2) from the middle of one box to those of others."""
+    """Return the unit vectors (..., 2) from the centre of one box to those of others."""
     apart = 0.5 * (end_px[..., :2] + end_px[..., 2:] - start_px[:2] - start_px[2:])
     return np.asarray(apart / (np.linalg.norm(apart, axis=-1, keepdims=True) + _TINY))
 
 
 def _matched(overlap: FloatArray, weight: FloatArray | float) -> list[tuple[int, int]]:
-    """Return the assignment of the largest sum of overlap and weight, without pairs that hardly overlap."""
+    """Return the assignment with the largest sum of overlap and weight, without pairs of low overlap."""
     cost = -(overlap + weight)
     return [(i, j) for i, j in gated_pairs(cost, overlap >= MIN_IOU, cost).tolist()]

@@ -1,1 +1,1 @@
-"""The whole chain on simulated streams: what is believed while vehicles come, pass and go."""
+"""The whole chain on simulated streams: beliefs while vehicles approach, pass and leave."""

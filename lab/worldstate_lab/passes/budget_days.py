@@ -1,9 +1,9 @@
-"""Days drawn from streams, on which the watch over an alarm's budget has to speak up, or to keep quiet.
+"""Simulated days on which the budget watch of an alarm should, or should not, report a broken budget.
 
-Time in which no vehicle comes into view, and bets on the chances, are cut into blocks of six minutes. A day
-is drawn from them, block by block and with replacement. For more onsets an hour as many blocks lie upon each
-other as a Poisson number says, so that onsets come in the clusters in which the alarm raised them. What a
-day brings is taken in by the watch's own evidence; of onsets all hours are of quiet time.
+Time without a vehicle coming into view, and bets on the published chances, are cut into blocks of six
+minutes. A day consists of blocks drawn with replacement. For a higher onset rate, a Poisson number of blocks
+is superimposed, so that the clusters of onsets are preserved. The watch processes each day as in operation.
+For onsets, all hours are quiet time.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,7 +24,7 @@ BLOCK_S, STEP_S, BLOCKS, LATER_BLOCKS = 360.0, 10.0, 240, 60  # A day, and six h
 
 
 def quiet_blocks(streams: Sequence[PassedStream]) -> FloatArray:
-    """Return the false onsets of every ten seconds of quiet time, shape (blocks, 36)."""
+    """Return the number of false onsets per ten seconds of quiet time, shape (blocks, 36)."""
     start_s, onsets_s = 0.0, list[float]()
     for tallies in (one.followed.tallies for one in streams):
         quiet_s = start_s + np.array([seconds(tally.quiet_ns) for tally in tallies])
@@ -37,7 +37,7 @@ def quiet_blocks(streams: Sequence[PassedStream]) -> FloatArray:
 
 
 def chance_blocks(streams: Sequence[PassedStream]) -> FloatArray:
-    """Return what outcomes bring against the chances, a bet every two seconds, shape (blocks, 180, 2)."""
+    """Return the evidence of outcomes against the chances, one bet per 2 s, shape (blocks, 180, 2)."""
     bets, every = list[list[float]](), round(BET_S / HOP_S)
     for one in streams:
         chances = one.followed.within[::every, :, HORIZONS_S.index(BET_S)]
@@ -50,18 +50,18 @@ def chance_blocks(streams: Sequence[PassedStream]) -> FloatArray:
 def budget_days(
     streams: Sequence[PassedStream], onsets_per_hour: float, days: int, rng: np.random.Generator
 ) -> Iterator[tuple[str, Figures]]:
-    """Yield how often the watch calls its claims broken, in so many days of each kind, and how soon.
+    """Yield how often and how soon the watch reports a broken claim, on days of each kind.
 
     Parameters
     ----------
     streams : sequence of PassedStream
-        From which days are drawn.
+        Source of the blocks.
     onsets_per_hour : float
         The budget.
     days : int
-        Of each kind.
+        Number of days of each kind.
     rng : numpy.random.Generator
-        Draws them.
+        Draws the days.
 
     Raises
     ------
@@ -71,12 +71,12 @@ def budget_days(
     quiet, chances = quiet_blocks(streams), chance_blocks(streams)
     if not quiet.sum():
         found = f"got none in {len(quiet) * BLOCK_S / 60.0:g} minutes"
-        raise InvalidArgumentError(f"streams: expected false onsets in quiet time, {found}: more streams")
+        raise InvalidArgumentError(f"streams: expected false onsets in quiet time, {found}; add streams")
     rate = float(quiet.mean() * SECONDS_PER_HOUR / STEP_S)
     factors = [onset_factors(n, STEP_S, onsets_per_hour) for n in range(round(STEP_S / HOP_S) + 1)]
 
     def onsets(per_hour: float, later: int = 0) -> Figures:
-        """Return the figures of days with so many onsets an hour, after some blocks as they are."""
+        """Return the figures of days with this onset rate, after some blocks with the original rate."""
         times_s = []
         for _ in range(days):
             before = quiet[rng.integers(len(quiet), size=later)]
@@ -87,7 +87,7 @@ def budget_days(
         return _figures(times_s, per_hour)
 
     def bets(blocks: FloatArray) -> Figures:
-        """Return the figures of days with such outcomes of chances."""
+        """Return the figures of days with these outcomes of chances."""
         drawn = (blocks[rng.integers(len(blocks), size=BLOCKS)].reshape(-1, 2).tolist() for _ in range(days))
         return _figures([broken_after_s(one, BET_S) for one in drawn])
 
@@ -103,7 +103,7 @@ def budget_days(
 
 
 def broken_after_s(factors: Iterable[Sequence[float]], step_s: float) -> float:
-    """Return after how long a claim is broken, infinite where it never is."""
+    """Return the time after which a claim is broken, infinite if it never is."""
     evidence = BudgetWatch().onsets
     for number, one in enumerate(factors, 1):
         evidence = evidence.after(one, step_s)

@@ -1,6 +1,6 @@
-"""Streams that the whole world-state follows: what is measured of them, and what the filter believed.
+"""Streams processed by the complete filter: measurements, and the beliefs of the filter.
 
-Of streams of which only the truth was kept a camera reports boxes frame by frame.
+If only the truth of a stream was kept, a simulated camera reports boxes frame by frame.
 """
 
 from collections.abc import Iterable, Iterator
@@ -40,11 +40,11 @@ from worldstate.state.context import Context
 from worldstate.state.cue import Tally
 
 FRAME_S = 0.1
-_STILL_M = 1e-3  # Of a tenth of a second: slower ones keep their heading
+_STILL_M = 1e-3  # Per 0.1 s: slower vehicles keep their heading
 
 
 def stream_detections(heard: HeardStream, rng: np.random.Generator) -> DetectionLog:
-    """Return the boxes of everybody in view, missed as often as the paper's detector misses them."""
+    """Return the boxes of all vehicles in view, with the miss rate of the paper's detector."""
     camera, site = PinholeCamera.ovad(), junction_named(heard.site)
     frames: dict[int, list[Row]] = {}
     kinds = dict(zip(heard.vehicles.vehicle.tolist(), heard.vehicles.kind.tolist(), strict=True))
@@ -67,7 +67,7 @@ def stream_detections(heard: HeardStream, rng: np.random.Generator) -> Detection
 
 
 def without_passes(detections: DetectionLog, heard: HeardStream) -> DetectionLog:
-    """Return a log whose camera is dead from every T0 on for as long as an approach is followed."""
+    """Return a log whose camera fails at every T0 and stays off during the approach."""
     entries_s = heard.vehicles.entry_s[heard.vehicles.hazard]
     since_s = detections.stamps_ns[:, None] * 1e-9 - entries_s[np.isfinite(entries_s)]
     alive = ~((since_s >= 0.0) & (since_s < AFTER_S)).any(axis=1)
@@ -76,7 +76,7 @@ def without_passes(detections: DetectionLog, heard: HeardStream) -> DetectionLog
 
 
 def _crossing(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return whether a vehicle drives left (1), right (-1) or along the ego's street (0) at every row."""
+    """Return whether a vehicle drives left (1), right (-1) or along the ego's street (0), per row."""
     dx, dy = (np.gradient(one) if one.size > 1 else np.zeros(one.size) for one in (x, y))
     sideways = np.abs(dy) > np.maximum(np.abs(dx), _STILL_M)
     return np.asarray(np.where(sideways, np.sign(dy), 0.0))
@@ -85,7 +85,8 @@ def _crossing(x: FloatArray, y: FloatArray) -> FloatArray:
 def _box(
     camera: PinholeCamera, site: Site, kind: VehicleKind, x: float, y: float, crossing: int
 ) -> FloatArray | None:
-    # Rows hold the front axle: the body reaches from the bumper ahead of it to a length behind.
+    # Rows contain the front axle: the body extends from the bumper ahead of it to one length behind the
+    # bumper.
     if crossing:
         front = y + crossing * kind.axles_m[0]
         ends = sorted((front, front - crossing * kind.length_m))
@@ -96,21 +97,21 @@ def _box(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowedStream:
-    """The snapshots of a stream by columns; sides are left and right."""
+    """The snapshots of a stream as columns; the two sides are left and right."""
 
     time_s: FloatArray  # shape (n,)
     advisory: BoolArray  # shape (n, 2)
     risk: FloatArray  # shape (n, 2)
-    within: FloatArray  # shape (n, 2, horizons); NaN where nothing is said
-    time_to_visible_s: FloatArray  # shape (n, 2, 3): Low, best, high; NaN where none is stated
-    masked: BoolArray  # shape (n,): Whether a reason is given why not all could be heard
-    unheard: BoolArray  # shape (n,): Whether the snapshot counts the hop as one in which nothing can be heard
-    entities: tuple[tuple[Entity, ...], ...]  # Of every hop
-    merged: frozenset[str]  # Ids that ended in another one
-    tallies: tuple[Tally, ...]  # Of every hop: what the watch over the alarm's budget has counted
+    within: FloatArray  # shape (n, 2, horizons); NaN if none is published
+    time_to_visible_s: FloatArray  # shape (n, 2, 3): Low, best, high; NaN if none is published
+    masked: BoolArray  # shape (n,): Whether the snapshot gives a reason for reduced audibility
+    unheard: BoolArray  # shape (n,): Whether the snapshot marks the hop as inaudible
+    entities: tuple[tuple[Entity, ...], ...]  # At every hop
+    merged: frozenset[str]  # Identifiers of entities merged into another one
+    tallies: tuple[Tally, ...]  # At every hop: counts of the watch over the alarm's budget
 
     def hidden(self, hop: int, side: int, least: float = 0.0) -> list[Entity]:
-        """Return the entities hidden on a side at a hop that exist with at least this probability."""
+        """Return the entities hidden on a side at a hop with at least this existence probability."""
         return [
             one
             for one in self.entities[hop]
@@ -120,14 +121,14 @@ class FollowedStream:
 
 
 def _share(entity: Entity, side: str) -> float:
-    """Return P(an entity is of a side | exists)."""
+    """Return P(an entity is on a side | it exists)."""
     known = {one.direction: one.probability for one in entity.sides}
     return known.get(side, 0.0) if known else float(entity.direction == side)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassedStream:
-    """A stream, its truth, and what the filter believed of it."""
+    """A stream with its truth and the beliefs of the filter."""
 
     heard: HeardStream
     truth: StreamTruth
@@ -137,7 +138,7 @@ class PassedStream:
 def followed(
     world: WorldFilter, measurements: Iterable[Measurement], street: StreetListener | None = None
 ) -> FollowedStream:
-    """Filter a stream; return what was believed after every measurement. `street` learns from passes."""
+    """Filter a stream; return the belief after every measurement. `street` learns from passes."""
     states: list[WorldState] = []
     for measurement in measurements:
         world = world.update(measurement)
@@ -160,7 +161,7 @@ def followed(
 
 
 CameraKind = Literal["all", "cars", "none", "dies"]
-# Everything that drives, however small its box; of OVAD's boxes its authors keep cars above 100 px.
+# Every vehicle, however small its box. OVAD's authors keep only cars above 100 px.
 EVERYBODY = DetectionFilter(frozenset({"car", "truck", "bus", "train", "motorcycle", "bicycle"}), 0.5, 20.0)
 
 
@@ -173,14 +174,14 @@ def passed_stream(
     *,
     learns: bool = True,
 ) -> PassedStream:
-    """Return a stream with what the filter believed at every hop; `seed` draws the camera's misses.
+    """Return a stream with the filter's beliefs at every hop; `seed` draws the camera's misses.
 
-    Unless told not to, the filter learns what either arm sounds like from the vehicles that come into view.
+    By default, the filter learns the sound of each arm from the vehicles that come into view.
 
     Raises
     ------
     InvalidArgumentError
-        If the model has no sequence, as `commission` makes one.
+        If the model has no sequence model; `commission` makes one.
     """
     street = street_listener(model.domain, None, None) if learns else None
     heard, measured = stream_measurements(path, model, camera, seed, street)
@@ -192,7 +193,7 @@ def passed_stream(
 def stream_measurements(
     path: Path, model: Model, camera: CameraKind, seed: int, street: StreetListener | None = None
 ) -> tuple[HeardStream, Iterator[Measurement]]:
-    """Return a stream with what microphones and camera measure of it, hop by hop."""
+    """Return a stream with the measurements of microphones and camera, hop by hop."""
     windows, sequence = parts_of(model)
     heard, vision = HeardStream.load(path), None
     if camera != "none":

@@ -1,16 +1,17 @@
-"""What became of every vehicle of a stream in the world-state: warned of, followed, lost, confused.
+"""Outcome of every vehicle of a stream in the world-state: warned, tracked, lost, confused.
 
-An advisory belongs to an approach from the risk's horizon, eight seconds, before the first T0 on. Identity is
-kept where the entity that was hidden on the vehicle's side at T0 is the one seen at its place a second later.
+An advisory is assigned to an approach if it is within the horizon of the risk, eight seconds, before the
+first T0. Identity is kept if the entity hidden on the vehicle's side at T0 is the one that is visible at its
+position a second later.
 
-Where vehicles mask each other, 300 Hz to 2 kHz, half a second: one of power p2 beside others of p1 adds
-10 log10(1 + p2 / (p1 + background)) decibels; the background is the level that a fifth of the stream's hops
-stays below.
+Masking between vehicles is computed in the band 300 Hz to 2 kHz over half a second: a vehicle of power p2
+beside others of power p1 adds 10 log10(1 + p2 / (p1 + background)) decibels; the background is the 20 %
+quantile of the level over the stream's hops.
 
-Of the second vehicle of an approach, while the first is in view or has just left, hops count from the first
-T0 until the second one's own, of the side that it comes from. Beside them stand hops of sides where no second
-one comes, as long after the first T0: each is shared among the groups as hops with a second vehicle are then,
-so that every group has the street's own odds.
+For the second vehicle of an approach, while the first is in view or has just left, the hops from the first T0
+to the second T0 are used, on the second vehicle's side. They are compared with hops of sides without a second
+vehicle at the same time after the first T0. These are distributed over the groups in proportion to the hops
+with a second vehicle at that time, so that every group has the base rate of the street.
 """
 
 import math
@@ -57,29 +58,29 @@ from worldstate.state import Entity
 from .followed_stream import PassedStream
 
 QUIET_SHARE, MEAN_HOPS = 0.2, 5
-_PASCAL = FULL_SCALE_PA / 32767.0  # Of one step of 16 bit
+_PASCAL = FULL_SCALE_PA / 32767.0  # One step of 16 bit
 
 
 def level_db(heard: HeardStream) -> FloatArray:
-    """Return the level of one microphone in the half second that ends with every hop, shape (n,)."""
+    """Return the level of one microphone in the half second before the end of each hop, shape (n,)."""
     pressure_pa = heard.hops.middle.ravel() * _PASCAL
     return sound_level_db(pressure_pa, float(heard.hops.about["sample_rate_hz"]), len(heard.hops))
 
 
 def sound_level_db(pressure_pa: AnyArray, sample_rate_hz: float, hops: int) -> FloatArray:
-    """Return the level of a sound of so many whole hops in the half second that ends with each of them."""
+    """Return the level of a sound with this many hops in the half second before the end of each hop."""
     sound = sosfilt(band_filter(sample_rate_hz), pressure_pa)
     power = np.square(sound).reshape(hops, -1).mean(axis=1)
     return np.asarray(10.0 * np.log10(_half_second(power) / REFERENCE_PA**2 + 1e-9))
 
 
 def above_place_db(heard: HeardStream) -> FloatArray:
-    """Return how far the level lies above its 20 % quantile of the stream so far, shape (n,)."""
+    """Return the level above its 20 % quantile of the stream so far, shape (n,)."""
     return above_quiet_db(level_db(heard))
 
 
 def above_quiet_db(level: FloatArray) -> FloatArray:
-    """Return how far a level lies above its 20 % quantile so far, shape (n,)."""
+    """Return the level above its 20 % quantile so far, shape (n,)."""
     past, place = list[float](), list[float]()
     for one in level.tolist():
         insort(past, one)
@@ -88,7 +89,7 @@ def above_quiet_db(level: FloatArray) -> FloatArray:
 
 
 def added_db(heard: HeardStream) -> FloatArray:
-    """Return what every vehicle adds to the level at every hop, shape (vehicles, n)."""
+    """Return the contribution of every vehicle to the level at every hop, shape (vehicles, n)."""
     rows, number = heard.rows, {name: i for i, name in enumerate(heard.vehicles.vehicle.tolist())}
     power = np.full((len(number), len(heard.hops)), SILENCE_PA2 / REFERENCE_PA**2)
     hop, inside = heard.row_hops()
@@ -110,15 +111,15 @@ HIDDEN_S, KEPT_S, KEPT_RAD = 3.0, 3.0, np.radians(20.0)
 
 @dataclass(frozen=True, slots=True)
 class PassOutcome:
-    """One approach: what the advisories made of it, and the entities."""
+    """Advisories and entities of one approach."""
 
     alarm: ApproachOutcome
-    hidden_before: int  # Different entities believed hidden before T0
-    identity: bool | None  # None where no entity was believed or seen there
+    hidden_before: int  # Number of different hidden entities before T0
+    identity: bool | None  # None if there was no hidden or no visible entity
 
 
 def outcomes(stream: PassedStream) -> list[PassOutcome]:
-    """Return the outcome of every approach that lies whole within the stream."""
+    """Return the outcome of every approach that is completely within the stream."""
     followed = stream.followed
     found = []
     for alarm in alarm_outcomes(stream.heard, followed.time_s, followed.advisory):
@@ -134,7 +135,7 @@ def outcomes(stream: PassedStream) -> list[PassOutcome]:
 
 
 def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
-    """Tell whether the entity hidden on the first vehicle's side at T0 is the one seen in its place later."""
+    """Return whether the entity hidden on the first vehicle's side at T0 is later visible at its position."""
     followed, entry_s = stream.followed, one.entries_s[0]
     hop = int(np.searchsorted(followed.time_s, entry_s - SLACK_S)) - 1
     hidden = followed.hidden(hop, one.sides[0])
@@ -151,14 +152,14 @@ def vehicle_at(heard: HeardStream, entry_s: float) -> int:
 
 
 def _true_azimuth(heard: HeardStream, vehicle: int, time_s: float) -> float | None:
-    """Return the azimuth of a vehicle, None where it is not there."""
+    """Return the azimuth of a vehicle, None if it is not present."""
     rows = heard.rows
     at = np.flatnonzero((rows.vehicle == vehicle) & (np.abs(rows.time_s - time_s) < 0.5 * HOP_S + SLACK_S))
     return None if not at.size else float(np.arctan2(rows.y_m[at[0]], rows.x_m[at[0]]))
 
 
 def seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
-    """Return the entity in view at the place of a vehicle; None where none is."""
+    """Return the entity in view at the position of a vehicle, None if there is none."""
     azimuth = _true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
     if azimuth is None:
         return None
@@ -172,7 +173,7 @@ def seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
 
 
 def pass_figures(streams: Sequence[PassedStream]) -> Figures:
-    """Return the figures of some streams together, ready for a table and for JSON."""
+    """Return the figures of several streams together, for a table and for JSON."""
     advised = [(one.heard, one.followed.advisory) for one in streams]
     table, short = (approach_table(advised, longest_s).loud() for longest_s in (HORIZON_S, LONGEST_LEAD_S))
     figures, former = (one.detections() | one.sides() for one in (table, short))
@@ -190,12 +191,13 @@ def pass_figures(streams: Sequence[PassedStream]) -> Figures:
     }
 
 
-# What was printed before alarms counted from the risk's horizon on.
+# Figures with a limit of 5 s before T0, for comparison with earlier results; alarms now count from the
+# horizon of the risk on.
 _OF_FIVE_SECONDS = ("detected", "lead_missed_as_0_s", "other_side_too", "both_sides_found")
 
 
 def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
-    """Return how many advisories and entities there were of loud approaches, and which were kept."""
+    """Return the numbers of advisories and entities of loud approaches, and the share of kept identities."""
     loud = [one for stream in streams for one in outcomes(stream) if not one.alarm.approach.quiet]
     judged = [one.identity for one in loud if one.identity is not None]
     both = [one.hidden_before for one in loud if one.alarm.approach.flow == "both"]
@@ -209,7 +211,7 @@ def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
 
 
 def sides_by_risk(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
-    """Return how often the other side of a single, too, and both of two reach a risk before T0."""
+    """Return how often the other side of a single vehicle, and both sides of two, reach a risk before T0."""
     names = ("other_side_too", "both_sides_found", "both_near_found")
     found = {}
     for least in RISKS:
@@ -219,7 +221,7 @@ def sides_by_risk(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
 
 
 def onsets_by_traffic(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
-    """Return how often streams of each traffic without hazards are warned of."""
+    """Return the onset rate on hazard-free streams, by traffic."""
     found: dict[str, list[tuple[HeardStream, BoolArray]]] = {}
     for one in streams:
         if one.heard.hazard_free:
@@ -230,7 +232,7 @@ def onsets_by_traffic(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
 
 
 def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Figures:
-    """Return what "louder than the place was" reaches at as many onsets an hour."""
+    """Return the detections of a level threshold at the same onset rate."""
     quiet = [above_place_db(one.heard) for one in streams if one.heard.hazard_free]
     if onsets_per_hour is None:
         return dict.fromkeys(("meter_detected", "meter_lead_missed_as_0_s", "meter_onsets_per_hour"))
@@ -241,7 +243,7 @@ def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Fi
 
 
 def _ahead(streams: Sequence[PassedStream]) -> Figures:
-    """Return how often a vehicle first seen straight ahead takes the identity of a hidden one."""
+    """Return how often a vehicle first detected straight ahead takes the identity of a hidden one."""
     taken = []
     for stream in streams:
         vehicles = stream.heard.vehicles
@@ -264,7 +266,7 @@ def _ahead(streams: Sequence[PassedStream]) -> Figures:
 def _hops_beside(
     streams: Sequence[PassedStream], first_s: float, end_s: float
 ) -> Iterator[tuple[PassedStream, StreamApproach, int, float]]:
-    """Yield the hops so long after the T0 of loud approaches, with the azimuth of the first vehicle then."""
+    """Yield the hops at a delay after the T0 of loud approaches, with the azimuth of the first vehicle."""
     for stream in streams:
         for one in approaches(stream.heard):
             vehicle = vehicle_at(stream.heard, one.entries_s[0])
@@ -277,7 +279,7 @@ def _hops_beside(
 
 
 def _kept(streams: Sequence[PassedStream]) -> Figures:
-    """Return how often an entity stands near a vehicle in the three seconds after T0, and how many do."""
+    """Return how often an entity is near a vehicle in the three seconds after T0, and how many are."""
     near = []
     for stream, one, hop, azimuth in _hops_beside(streams, 0.0, KEPT_S):
         if one.flow == "single":
@@ -295,7 +297,7 @@ def _forecast(streams: Sequence[PassedStream]) -> Figures:
     stated = np.concatenate([one.followed.time_to_visible_s.reshape(-1, 3) for one in streams])
     return {
         **chance_figures(within[said], coming_s[said]),
-        # The risk is of a hidden vehicle that comes into view within the time that the sequence foresees.
+        # The risk is that of a hidden vehicle coming into view within the horizon of the sequence model.
         "risk_skill": brier_skill(risk, coming_s <= HORIZON_S),
         "risk_ece": expected_calibration_error(risk, coming_s <= HORIZON_S),
         **time_figures(stated, coming_s),
@@ -303,13 +305,13 @@ def _forecast(streams: Sequence[PassedStream]) -> Figures:
     }
 
 
-# A vehicle that leaves is compared in as long a time about its loudest as one that comes has before its T0,
-# where nothing comes near that time.
+# Vehicles that leave are compared in an interval around their loudest moment as long as that of approaching
+# vehicles before T0, if no other vehicle comes near that time.
 _COMPARED_S, _ALONE_S, CERTAIN = 3.0, 10.0, 0.8
 
 
 def _leaving(streams: Sequence[PassedStream]) -> Figures:
-    """Return how well the risk ranks loud vehicles that come above those that drive off behind the corner."""
+    """Return how well the risk ranks loud approaching vehicles above those that leave behind the corner."""
     coming, leaving = [], []
     for stream in streams:
         time_s, most = stream.followed.time_s, stream.followed.risk.max(axis=1)
@@ -331,7 +333,7 @@ def _leaving(streams: Sequence[PassedStream]) -> Figures:
 
 
 def _certain(streams: Sequence[PassedStream]) -> Figures:
-    """Return how often a chance above `CERTAIN` to come within two seconds is right, and how often said."""
+    """Return the precision and the frequency of chances above `CERTAIN` to come into view within 2 s."""
     at, right, said = HORIZONS_S.index(2.0), [], []
     for one in streams:
         certain = np.nan_to_num(one.followed.within[:, :, at]) > CERTAIN
@@ -342,7 +344,7 @@ def _certain(streams: Sequence[PassedStream]) -> Figures:
 
 
 def _bearing(streams: Sequence[PassedStream]) -> Figures:
-    """Return how far hidden azimuths are off, and the same over their variance, in the 3 s before T0."""
+    """Return the errors of hidden azimuths, and squared errors over variance, in the 3 s before T0."""
     errors_rad, stds_rad = [], []
     for stream, one, hop, azimuth in _hops_beside(streams, np.nextafter(-HIDDEN_S, 0.0), -SLACK_S):
         for entity in stream.followed.hidden(hop, one.sides[0], EXISTS)[:1]:
@@ -358,7 +360,7 @@ def _bearing(streams: Sequence[PassedStream]) -> Figures:
 
 
 WITHIN_S, NOTICED_DB, STATED = 3.0, 1.0, 0.3
-JUST_LEFT_S = 2.0  # What has left the view is as loud as it was for so long, and masks as before
+JUST_LEFT_S = 2.0  # A vehicle that left the view remains loud, and masks others, for this long
 SIDES_OF = ("other", "behind")
 GAPS_S = {"below 1.5 s": (0.0, 1.5), "1.5 to 4 s": (1.5, 4.0)}
 BEFORE_S = (3.0, 2.0, 1.5, 1.0, 0.5, 0.1, -0.4)
@@ -366,13 +368,13 @@ COLUMNS = ("behind", "since", "gap_s", "added_db", "chance", "comes", "masked")
 
 
 def second_hops(stream: PassedStream) -> HopTable:
-    """Return hops of both sides after the first T0, until a second vehicle comes; no gap where none does."""
+    """Return hops of both sides after the first T0 until a second vehicle comes; gap NaN if none does."""
     rows = [row for one, added in _loud(stream) for row in _rows(stream, one, added)]
     return HopTable.of_rows(COLUMNS, rows)
 
 
 def _loud(stream: PassedStream) -> Iterator[tuple[StreamApproach, FloatArray]]:
-    """Yield the loud approaches, with what the last vehicle adds at every hop."""
+    """Yield the loud approaches with the level that the last vehicle adds at every hop."""
     loud = [one for one in approaches(stream.heard) if not one.quiet]
     numbers, added = (
         stream.heard.vehicles.vehicle.tolist(),
@@ -400,7 +402,7 @@ def _rows(stream: PassedStream, one: StreamApproach, added: FloatArray) -> Itera
 
 
 def second_figures(streams: Sequence[PassedStream]) -> Figures:
-    """Return what is stated of second vehicles, and what becomes of their entities, by side and gap."""
+    """Return figures of the chances and the entities of second vehicles, by side and gap."""
     hops = joined(map(second_hops, streams))
     kept = [row for stream in streams for row in _kept_apart(stream)]
     heard = hops.added_db >= NOTICED_DB
@@ -418,7 +420,7 @@ def second_figures(streams: Sequence[PassedStream]) -> Figures:
 
 
 def _noticed(hops: HopTable, mine: BoolArray) -> Figures:
-    """Return the Brier skill of the chance where the second one adds a decibel or more."""
+    """Return the Brier skill of the chance if the second vehicle adds a decibel or more."""
     weight = _with_empty(hops, mine)
     share = np.average(hops.comes, weights=weight) if mine.any() else 0.0
     constant = share * (1.0 - share)
@@ -427,7 +429,7 @@ def _noticed(hops: HopTable, mine: BoolArray) -> Figures:
 
 
 def _masked(hops: HopTable, mine: BoolArray) -> Figures:
-    """Return how far chances are from shares where it adds less, and how often `heard` gives a reason."""
+    """Return the calibration of chances if it adds less, and how often `heard` gives a reason."""
     names = ("stated", "true", "ECE", "said masked")
     if not mine.any():
         return dict.fromkeys(names)
@@ -439,7 +441,7 @@ def _masked(hops: HopTable, mine: BoolArray) -> Figures:
 
 
 def _with_empty(hops: HopTable, mine: BoolArray) -> FloatArray:
-    """Return weights: 1 of some hops with a second vehicle, of empty ones as long after T0 their share."""
+    """Return weights: 1 for hops with a second vehicle, and for empty ones at the same delay their share."""
     pair = np.isfinite(hops.gap_s)
     key = 2 * hops.since.astype(np.intp) + hops.behind.astype(np.intp)
     some, every = (np.bincount(key[which], minlength=key.max(initial=0) + 1) for which in (mine, pair))
@@ -447,9 +449,9 @@ def _with_empty(hops: HopTable, mine: BoolArray) -> FloatArray:
 
 
 def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool, bool]]:
-    """Yield side and gap of second vehicles, and what became of the entity stated before the first T0.
+    """Yield side and gap of second vehicles, and three flags on the entity published before the first T0.
 
-    Whether there was one, whether it is seen in the vehicle's place, and whether it became the first's.
+    The flags are: it existed, it is visible at the vehicle's position, it became that of the first vehicle.
     """
     followed = stream.followed
     for one, _ in _loud(stream):
@@ -457,8 +459,8 @@ def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool,
             continue
         behind = one.sides[0] == one.sides[1]
         before = int(np.searchsorted(followed.time_s, one.entries_s[0] - SLACK_S)) - 1
-        # By its share of that side: one of unknown side is the first's, too. Behind another one the
-        # likeliest entity is that one's.
+        # By its share of that side, because an entity of unknown side may be the first vehicle's too. Behind
+        # another vehicle, the likeliest entity is the first vehicle's.
         hidden = sorted(followed.hidden(before, one.sides[1], STATED), key=lambda e: -e.existence_probability)
         stated = {e.id for e in hidden[behind:]}
         first, second = (_seen_after(stream, entry_s) for entry_s in one.entries_s)
@@ -467,14 +469,14 @@ def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool,
 
 
 def _seen_after(stream: PassedStream, entry_s: float) -> str | None:
-    """Return the id of the entity seen at the place of the vehicle that came into view, a second later."""
+    """Return the identifier of the entity at the vehicle's position one second after it came into view."""
     later = int(np.searchsorted(stream.followed.time_s, entry_s + SEEN_AFTER_S))
     found = seen_at(stream, vehicle_at(stream.heard, entry_s), min(later, len(stream.followed.time_s) - 1))
     return None if found is None else found.id
 
 
 def hearing_allows(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
-    """Return the median of what second vehicles add, in dB, by seconds before their own T0, side and gap."""
+    """Return the median level added by second vehicles, in dB, by time before their own T0, side and gap."""
     found: dict[str, Figures] = {f"{-before:g} s": {} for before in BEFORE_S}
     pairs = [(s, one, added) for s in streams for one, added in _loud(s) if len(one.entries_s) > 1]
     for (behind, side), (gap, (low, high)) in product(enumerate(SIDES_OF), GAPS_S.items()):

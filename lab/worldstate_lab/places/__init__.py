@@ -1,1 +1,1 @@
-"""How well a place behind the corner is known: simulated passes, and real maps with a metric truth."""
+"""Accuracy of positions behind the corner: simulated passes, and real maps with a metric truth."""

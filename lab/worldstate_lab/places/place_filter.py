@@ -1,9 +1,9 @@
-r"""Exact filter over place and speed on a grid, with a state for an empty street.
+r"""Exact grid filter over position and speed on the crossing street, with a state for an empty street.
 
 .. math:: p_t(x', v') \propto L_t(x') \sum_{x, v} T_v(x' | x)\, A(v' | v)\, p_{t-1}(x, v)
 
-Places move by v dt, speeds by a random walk. A vehicle that leaves the grid leaves the street empty; one that
-comes may be anywhere on it.
+Positions change by v dt, speeds by a random walk. If a vehicle leaves the grid, the street is empty; a new
+vehicle has a uniform position on it.
 """
 
 from dataclasses import dataclass
@@ -17,33 +17,34 @@ from worldstate.measurement.position import Position
 
 from .spectrum_model import FARTHEST_M, STEP_M, RayModel, SpectrumModel
 
-# Toward the left and toward the right: streets in town, cars that creep into a junction included.
+# To the left and to the right: urban speeds, and cars that creep into a junction.
 SPEEDS_MPS = np.arange(1.0, 8.1, 0.5)
 VELOCITIES_MPS = np.concatenate([-SPEEDS_MPS[::-1], SPEEDS_MPS])
-# m/s in a second: drivers brake by .5 to 1 m/s^2 before a junction.
+# m/s in one second: drivers brake with 0.5 to 1 m/s^2 before a junction.
 SPEED_NOISE = 0.5
 TURNS_HZ = 1e-3  # Few vehicles turn round in a street
-# The rates of `state.Rates`, both sides; departures are of vehicles that leave without passing.
+# The rates of `state.Rates`, both sides together; departures are vehicles that leave without passing.
 ARRIVALS_HZ, DEPARTURES_HZ = 0.1, 0.01
-# An axle is heard, and the middle of the vehicle is meant: half a wheelbase of 2.7 m, and some.
+# The sound comes from an axle, but the position is that of the vehicle's centre, half a wheelbase (1.35 m)
+# away at most.
 EXTENT_STD_M = 1.0
 STATED_STD_M = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceEstimate:
-    """Belief about one vehicle on the crossing street; all but its existence given that there is one.
+    """Belief about one vehicle on the crossing street; all fields but the last are given that it exists.
 
     Parameters
     ----------
     mean_m, std_m : float
-        Of the place along the street, left positive.
+        Of the position along the street, left positive.
     interval_m : (float, float)
         From the 5 % to the 95 % quantile.
     left_probability : float
-        That it is left of the ego's axis.
+        Probability that it is left of the ego's axis.
     existence_probability : float
-        That there is a vehicle.
+        Probability that there is a vehicle.
 
     Examples
     --------
@@ -59,13 +60,13 @@ class PlaceEstimate:
 
     @property
     def stated(self) -> bool:
-        """Whether a place can be stated; otherwise only the side."""
+        """Whether a position can be published; otherwise only the side."""
         return self.std_m < STATED_STD_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceBelief:
-    """Log probabilities of every velocity and place, and of an empty street.
+    """Log probabilities of every velocity and position, and of an empty street.
 
     Examples
     --------
@@ -78,14 +79,14 @@ class PlaceBelief:
 
     @property
     def of_places(self) -> FloatArray:
-        """Probability of every place, given a vehicle, shape (N,)."""
+        """Probability of every position, given a vehicle, shape (N,)."""
         present = np.exp(self.log_present - self.log_present.max()).sum(axis=0)
         return np.asarray(present / present.sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceFilter:
-    """Carries the belief about one vehicle from one spatial spectrum to the next.
+    """Updates the belief about one vehicle from one spatial spectrum to the next.
 
     Parameters
     ----------
@@ -114,7 +115,7 @@ class PlaceFilter:
 
     @property
     def unknown(self) -> PlaceBelief:
-        """Belief before anything was heard: a vehicle as probable as none, anywhere."""
+        """Return the belief before any sound: existence 0.5, uniform position."""
         shape = len(VELOCITIES_MPS), len(self.model.along_m)
         return PlaceBelief(np.full(shape, -np.log(2.0 * shape[0] * shape[1])), -np.log(2.0))
 
@@ -128,7 +129,7 @@ class PlaceFilter:
         come = empty * -np.expm1(-ARRIVALS_HZ * dt_s)
         left = max(1.0 - empty - present.sum(), 0.0)
         present = present + come / present.size
-        # Underflow leaves places that nothing could ever bring back.
+        # After underflow to zero, no evidence could raise the probability of a position again.
         return PlaceBelief(np.log(np.maximum(present, 1e-300)), float(np.log(empty - come + left + 1e-300)))
 
     def update(self, belief: PlaceBelief, spectrum: FloatArray) -> PlaceBelief:
@@ -140,7 +141,7 @@ class PlaceFilter:
         return PlaceBelief(present - total, float(empty - total))
 
     def estimate(self, belief: PlaceBelief) -> PlaceEstimate:
-        """Return what can be said of the middle of the vehicle."""
+        """Return the estimate for the centre of the vehicle."""
         along = self.model.along_m
         heard = belief.of_places
         shares = np.convolve(heard, _extent(), mode="same")
@@ -155,14 +156,14 @@ class PlaceFilter:
 
 @lru_cache(maxsize=4)
 def _transitions(dt_s: float) -> tuple[FloatArray, FloatArray]:
-    """Speeds, shape (V, V), and places by velocity, shape (V, N, N), from rows to columns."""
+    """Return the transitions of speeds, (V, V), and of positions by velocity, (V, N, N), rows to columns."""
     from scipy.linalg import expm
 
     number, places = len(VELOCITIES_MPS), round(2.0 * FARTHEST_M / STEP_M) + 1
     rate = 0.5 * (SPEED_NOISE / (SPEEDS_MPS[1] - SPEEDS_MPS[0])) ** 2
     generator = rate * (np.eye(number, k=1) + np.eye(number, k=-1))
     middle = number // 2
-    # Between the slowest to the left and the slowest to the right lies a stop: that is turning round.
+    # Between the slowest speeds to the left and to the right the vehicle would have to stop: this is a turn.
     generator[middle - 1, middle] = generator[middle, middle - 1] = 0.0
     generator += TURNS_HZ * np.eye(number)[::-1]
     generator -= np.diag(generator.sum(axis=1))
@@ -171,8 +172,8 @@ def _transitions(dt_s: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _moved(steps: float, places: int) -> FloatArray:
-    """Matrix that moves by a number of steps in the mean, with a variance of 1/4 step^2, (places, places)."""
-    # Linear interpolation would spread slow vehicles and leave those that move by whole steps sharp.
+    """Return a matrix that moves by a mean number of steps, variance 1/4 step^2, (places, places)."""
+    # Linear interpolation would blur slow vehicles but not those that move by whole steps.
     whole = int(np.rint(steps))
     rest, spread = steps - whole, 0.25
     ahead, back = 0.5 * (spread + rest**2 + rest), 0.5 * (spread + rest**2 - rest)
@@ -186,26 +187,26 @@ def _extent() -> FloatArray:
 
 
 LANE_STD_M = 1.0  # Either lane of the crossing street
-# A place heard through walls never proves a vehicle.
+# Sound from behind walls is never proof of a vehicle.
 LEAST_EXISTENCE, MOST_EXISTENCE = 0.01, 0.99
 
 
 def added_position(now: PlaceEstimate, before: PlaceEstimate, crossing_m: float) -> Position | None:
-    r"""Return what spectra have added to a belief that was carried on without them, for the world filter.
+    r"""Return the information that spectra added to a belief predicted without them, for the world filter.
 
-    The filter of places has counted every spectrum already. Of a place with mean m and variance P, and m', P'
-    without these spectra, the equivalent measurement is
+    The filter of positions has already used every spectrum. For a position with mean m and variance P, and
+    m', P' without these spectra, the equivalent measurement is
 
     .. math:: R^{-1} = P^{-1} - P'^{-1}, \qquad z = R (P^{-1} m - P'^{-1} m').
 
-    None where no place can be stated, or the spectra told no more than what was known already.
+    None if no position can be published, or the spectra added no information.
 
     Parameters
     ----------
     now, before : PlaceEstimate
         With and without these spectra, at one time.
     crossing_m : float
-        How far ahead vehicles cross.
+        Distance ahead at which vehicles cross.
 
     Examples
     --------

@@ -1,19 +1,20 @@
-r"""Likelihood of a spatial spectrum given a place on the crossing street.
+r"""Likelihood of a spatial spectrum given a position on the crossing street.
 
-After the phase transform every frequency counts alike, and its power is shared by the paths p and the diffuse
-sound d. What SRP over azimuth is then expected to be is a mix of the array's responses B to plane waves,
+After the phase transform every frequency has equal weight, and its power is divided among the paths p and the
+diffuse sound d. The expected SRP over azimuth is a mixture of the array's responses B to plane waves,
 
 .. math:: t_x(\theta) = \Big\langle \frac{\sum_p g_p(x, f) B_f(\theta, \theta_p) + d D_f(\theta)}
                                         {\sum_p g_p(x, f) + d} \Big\rangle_f .
 
-A spectrum comes at any scale and offset: both are fitted, in the metric of the array's resolution
+Scale and offset of a spectrum are arbitrary. Both are fitted in the metric of the array's resolution
 :math:`C(\theta, \theta') = \langle B_f(\theta, \theta') \rangle_f + \lambda I`, which leaves the correlation
-r of spectrum and template. How much the walls reflect, the corner lets pass and the street adds is unknown:
-the likelihood is the mean over draws k of these,
+r of spectrum and template. The reflection of the walls, the screen loss at the corner and the sound of the
+street are unknown: the likelihood is the mean over draws k of them,
 
 .. math:: L(x) = \Big\langle w_k (1 - r_+^2)^{-\nu/2} + (1 - w_k) (1 - r_0^2)^{-\nu/2} \Big\rangle_k ,
 
-with w the share of the sound that comes by paths, and r_0 what a spectrum without a vehicle reaches.
+where w is the share of the sound that arrives by paths, and r_0 the correlation of a spectrum without a
+vehicle.
 """
 
 from collections.abc import Iterator
@@ -27,32 +28,33 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
 SPEED_OF_SOUND_MPS = 343.0
-# Far vehicles are heard by the order whose line still meets the mouth: 2 at 11 m, 3 at 15 m, on alternating
-# sides. With three orders a real vehicle at 9 m was put on the wrong side for half a second.
+# Sound of far vehicles arrives with the order whose ray still meets the mouth: 2 at 11 m, 3 at 15 m, on
+# alternating sides. With three orders a real vehicle at 9 m was estimated on the wrong side for half a
+# second.
 SIDE_ORDER, FACADE_ORDER = 8, 2
-# A line this far inside the mouth has lost the corner's 5 dB.
+# A ray this far inside the mouth no longer has the corner's loss of 5 dB.
 LIT_DEPTH_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class StreetWalls:
-    """Two side walls that end at the corners, the street that crosses beyond them, and the wall it faces.
+    """Two side walls up to the corners, the crossing street beyond them, and the wall opposite the ego.
 
     Parameters
     ----------
     corner_ahead_m : float
-        How far ahead of the array the corners stand, at the ends of the side walls.
+        Distance of the corners ahead of the array, at the ends of the side walls.
     left_m, right_m : float
         Distance of the side walls to the left and to the right of the array.
     crossing_m : float
-        How far ahead vehicles cross, beyond the corners.
+        Distance ahead at which vehicles cross, beyond the corners.
     facing_m : float or None
-        How far ahead the wall beyond the crossing street stands; None where there is none.
+        Distance ahead of the wall beyond the crossing street; None if there is none.
 
     Raises
     ------
     InvalidArgumentError
-        If a distance is out of range, or the street does not lie between corners and facing wall.
+        If a distance is out of range, or the street is not between the corners and the facing wall.
 
     Examples
     --------
@@ -75,18 +77,18 @@ class StreetWalls:
 
     @property
     def sight_m(self) -> tuple[float, float]:
-        """Limits (right, left) of what is in line of sight on the crossing street, y left positive."""
+        """Limits (right, left) of the part of the crossing street in line of sight, y left positive."""
         reach = self.crossing_m / self.corner_ahead_m
         return -self.right_m * reach, self.left_m * reach
 
 
 @dataclass(frozen=True, slots=True)
 class SoundPath:
-    """One way from every place, shape (N,), at every frequency, (F,)."""
+    """One propagation path from every position, shape (N,), at every frequency, (F,)."""
 
-    azimuth_rad: FloatArray  # shape (N,): Where it arrives from
+    azimuth_rad: FloatArray  # shape (N,): Direction of arrival
     length_m: FloatArray  # shape (N,)
-    passed: FloatArray  # shape (N, F): Share of the power that the corner lets pass
+    passed: FloatArray  # shape (N, F): Share of the power that passes the corner
     facades: int  # Number of reflections in the crossing street
     side_walls: tuple[int, int]  # Number of reflections in the left and in the right side wall
 
@@ -100,7 +102,7 @@ class SoundPath:
 def sound_paths(
     walls: StreetWalls, crossing_m: float, along_m: FloatArray, frequencies_hz: FloatArray
 ) -> list[SoundPath]:
-    """Return all ways from places on a lane, those from behind a corner included.
+    """Return all paths from positions on a lane, including those from behind a corner.
 
     Examples
     --------
@@ -125,7 +127,7 @@ def sound_paths(
 
 
 def _source_images(walls: StreetWalls, crossing_m: float) -> list[float]:
-    """Distances ahead of a lane and of its images in the two facades of the crossing street."""
+    """Return the distances ahead of a lane and of its images in the two facades of the crossing street."""
     if walls.facing_m is None:
         return [crossing_m]
     mouth, depth = walls.corner_ahead_m, walls.facing_m - walls.corner_ahead_m
@@ -136,7 +138,7 @@ def _source_images(walls: StreetWalls, crossing_m: float) -> list[float]:
 
 
 def _array_images(walls: StreetWalls) -> Iterator[tuple[float, int, tuple[int, int]]]:
-    """Yield lateral place, orientation and reflections (left, right) of the array's images."""
+    """Yield lateral position, orientation and reflections (left, right) of the array's images."""
     yield 0.0, 1, (0, 0)
     width = walls.left_m + walls.right_m
     for order in range(1, SIDE_ORDER + 1):
@@ -147,37 +149,39 @@ def _array_images(walls: StreetWalls) -> Iterator[tuple[float, int, tuple[int, i
 
 
 def _corner_share(detour_m: FloatArray, inside_m: FloatArray, frequencies_hz: FloatArray) -> FloatArray:
-    r"""Power behind a screen, (N, F), after Maekawa: :math:`1 / (3 + 20 N)`, :math:`N = 2 \delta f / c`."""
+    r"""Return the share behind a screen, (N, F): :math:`1 / (3 + 20 N)`, :math:`N = 2 \delta f / c`."""
     # Z. Maekawa, "Noise reduction by screens", Applied Acoustics 1 (1968): 10 log10(3 + 20 N) dB.
     fresnel = 2.0 * detour_m[:, None] * frequencies_hz / SPEED_OF_SOUND_MPS
     lit = np.clip(inside_m / LIT_DEPTH_M, 0.0, 1.0)[:, None]
     return np.where(inside_m[:, None] < 0.0, 1.0 / (3.0 + 20.0 * fresnel), (1.0 + 2.0 * lit) / 3.0)
 
 
-# Vehicles farther than this are not told from the rest of the street: in simulated passes and in real ones
-# without positions the first seconds start at 17 to 20 m.
+# Vehicles farther away cannot be distinguished from the rest of the street: in simulated passes, and in real
+# ones without positions, detectable sound starts at 17 to 20 m.
 FARTHEST_M, STEP_M = 22.0, 0.5
-# Each of 32 draws takes these uniformly: pressure reflection factor of the left and right side walls and of
-# the facades, diffuse sound against a vehicle at 1 m (dB), screen loss against Maekawa's (dB), lane (m).
+# Each of 32 draws samples these uniformly: pressure reflection factor of the left and right side walls and of
+# the facades, diffuse sound relative to a vehicle at 1 m (dB), screen loss relative to Maekawa's (dB), lane
+# (m).
 DRAWS = 32
 LEAST = np.array([0.65, 0.65, 0.5, -35.0, -3.0, -1.0])
 MOST = np.array([1.0, 1.0, 1.0, -15.0, 3.0, 1.0])
-# Additive recurrence on powers of the root of g^7 = g + 1 fills six dimensions evenly without a generator.
+# An additive recurrence on powers of the root of g^7 = g + 1 fills six dimensions evenly without a random
+# generator.
 _GOLDEN = 1.1127756842787055 ** -np.arange(1.0, 7.0)
-# Tyres and engine: a vehicle is heard at three points along it.
+# Tyres and engine: the sound comes from three points along a vehicle.
 PARTS_M = (-1.3, 0.0, 1.3)
-# Degrees of freedom of a spectrum 0.1 s after the last one, of some ten that the array resolves, and the
-# share r_0^2: set on 40 simulated passes (the 90 % interval covers .89) and on real ones without positions.
-# With 6 and .35 the error is .3 m less in simulation and .3 m more on the real ones.
+# Degrees of freedom of a spectrum 0.1 s after the previous one, of about ten that the array resolves, and the
+# share r_0^2. They were set on 40 simulated passes (the 90 % interval covers 0.89) and on real ones without
+# positions. With 6 and 0.35 the error is 0.3 m smaller in simulation and 0.3 m larger on the real ones.
 FREEDOM, CHANCE = 4.5, 0.3
-# Below this share of the whole the metric counts no direction: noise of the microphones and of the method.
+# Directions below this share of the total are ignored by the metric: noise of microphones and method.
 LEAST_RESOLVED = 1e-3
-# r = 1 would be certainty.
+# r = 1 would mean certainty.
 MOST_ALIKE = 0.999
-# Of the plain likelihood: constant weights of direct, bent and once reflected rays.
+# Constant weights of direct, diffracted and singly reflected rays in the simple likelihood.
 DIRECT, BENT, REFLECTED = 1.0, 0.5, 0.5
-# Nats for a ray at the peak against one at the lowest level; of 2, 4, 8 and 16 the least error on the
-# simulated passes on which the constants above were set.
+# Nats between a ray at the peak and one at the lowest level. Of 2, 4, 8 and 16, the value with the smallest
+# error on the simulated passes on which the constants above were set.
 SHARPNESS = 16.0
 _ARRIVALS_RAD = np.radians(np.arange(-90.0, 90.5, 1.0))
 _ALL_ROUND_RAD = np.radians(np.arange(-180.0, 180.0, 5.0))
@@ -185,7 +189,7 @@ _ALL_ROUND_RAD = np.radians(np.arange(-180.0, 180.0, 5.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpectrumModel:
-    """Expected spatial spectra of an array between known walls, and how likely one is from every place.
+    """Expected spatial spectra of an array between known walls, and the likelihood of a spectrum by position.
 
     Examples
     --------
@@ -199,9 +203,9 @@ class SpectrumModel:
     """
 
     walls: StreetWalls
-    along_m: FloatArray  # shape (N,): Places along the crossing street, left positive
-    metric: FloatArray  # shape (G, G): Square root of the inverse of C, without the constant
-    templates: FloatArray  # shape (K, N, G): Expected spectra in that metric, of length 1
+    along_m: FloatArray  # shape (N,): Positions along the crossing street, left positive
+    metric: FloatArray  # shape (G, G): Square root of the inverse of C, without the constant component
+    templates: FloatArray  # shape (K, N, G): Expected spectra in that metric, normalised to length 1
     heard_share: FloatArray  # shape (K, N): w
 
     @classmethod
@@ -214,20 +218,20 @@ class SpectrumModel:
         *,
         draws: int = DRAWS,
     ) -> "SpectrumModel":
-        """Expect spectra of an array on given azimuths, left positive, summed over given frequencies.
+        """Compute expected spectra of an array on given azimuths, left positive, summed over frequencies.
 
         Parameters
         ----------
         walls : StreetWalls
-            Where sound is reflected and bent.
+            Geometry of reflection and diffraction.
         array : MicrophoneArray
-            What listens, its axes those of the walls.
+            The array, in the axes of the walls.
         azimuths_rad : ndarray, shape (G,)
-            Of the spectra that will come; left positive.
+            Azimuths of the spectra; left positive.
         frequencies_hz : ndarray, shape (F,)
-            That they are summed over.
+            Frequencies of the sum.
         draws : int
-            Number K of unknown reflection factors and levels that are averaged over.
+            Number K of draws of reflection factors and levels for the mean.
 
         Returns
         -------
@@ -237,7 +241,7 @@ class SpectrumModel:
         frequencies = finite_array("frequencies_hz", frequencies_hz, (None,))
         along = np.arange(-FARTHEST_M, FARTHEST_M + 0.5 * STEP_M, STEP_M)
         beams = _responses(array, frequencies, azimuths, _ARRIVALS_RAD)
-        # All frequencies in one matrix product: a product for each took 12 s instead of 1.
+        # All frequencies in one matrix product: separate products took 12 s instead of 1.
         beams = np.ascontiguousarray(beams.transpose(0, 2, 1)).reshape(-1, len(azimuths)) / len(frequencies)
         diffuse = _responses(array, frequencies, azimuths, _ALL_ROUND_RAD).mean(axis=2) / len(frequencies)
         metric = _metric(_responses(array, frequencies, azimuths, azimuths).mean(axis=0))
@@ -254,7 +258,7 @@ class SpectrumModel:
         return cls(walls, along, metric, np.array(templates), np.array(heard))
 
     def log_likelihood(self, spectrum: FloatArray) -> tuple[FloatArray, float]:
-        """Return the log-likelihood of a spectrum, of any scale and offset, from every place and of none.
+        """Return the log-likelihood of a spectrum at any scale and offset, by position and without a vehicle.
 
         Parameters
         ----------
@@ -264,17 +268,19 @@ class SpectrumModel:
         Returns
         -------
         tuple of (ndarray, float)
-            Of every place in `along_m`, and without a vehicle, nats, up to a common constant.
+            For every position in `along_m`, and without a vehicle, in nats up to a common constant.
 
         Raises
         ------
         InvalidArgumentError
-            If it has another shape, is not finite, or is the same in all directions.
+            If the shape is wrong, a value is not finite, or all values are equal.
         """
         values = finite_array("spectrum", spectrum, (len(self.metric),))
         if np.ptp(values) == 0.0:
-            raise InvalidArgumentError(f"spectrum: expected differences over azimuth, got {values[0]:g} only")
-        # Of any scale: centred first, so that a large offset does not cost digits.
+            raise InvalidArgumentError(
+                f"spectrum: expected values that differ over azimuth, got only {values[0]:g}"
+            )
+        # The scale is arbitrary. Values are centred first, because a large offset would reduce precision.
         alike = np.clip(self.templates @ _directions((values - values.mean()) @ self.metric), 0.0, MOST_ALIKE)
         by_path = (1.0 - alike**2) ** (-0.5 * FREEDOM)
         by_chance = (1.0 - CHANCE) ** (-0.5 * FREEDOM)
@@ -284,7 +290,7 @@ class SpectrumModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayModel:
-    """Plain likelihood to compare with: the mean of the spectrum where three kinds of rays arrive.
+    """Simple likelihood for comparison: the mean of the spectrum at the arrivals of three kinds of rays.
 
     Examples
     --------
@@ -301,7 +307,7 @@ class RayModel:
 
     @classmethod
     def of(cls, walls: StreetWalls, azimuths_rad: FloatArray, along_m: FloatArray) -> "RayModel":
-        """Trace the rays from all places."""
+        """Trace the rays from all positions."""
         every, columns = np.arange(len(along_m)), np.zeros((len(azimuths_rad), len(along_m)))
         for path in sound_paths(walls, walls.crossing_m, along_m, np.array([1000.0])):
             order = path.facades + sum(path.side_walls)
@@ -313,26 +319,26 @@ class RayModel:
         return cls(walls, along_m, columns / columns.sum(axis=0))
 
     def log_likelihood(self, spectrum: FloatArray) -> tuple[FloatArray, float]:
-        """Return the log-likelihood from every place; an empty street is not a state of the plain filter."""
+        """Return the log-likelihood by position; an empty street is not a state of the simple filter."""
         level = (spectrum - spectrum.min()) / np.ptp(spectrum)
         return SHARPNESS * (level @ self.columns), -np.inf
 
 
 def _draws(number: int) -> FloatArray:
-    """Values between `LEAST` and `MOST`, shape (number, 6)."""
+    """Return values between `LEAST` and `MOST`, shape (number, 6)."""
     return np.asarray(LEAST + (MOST - LEAST) * np.mod(0.5 + np.arange(1, number + 1)[:, None] * _GOLDEN, 1.0))
 
 
 def _arriving(
     walls: StreetWalls, along_m: FloatArray, frequencies_hz: FloatArray, draw: FloatArray
 ) -> FloatArray:
-    """Power from every place by azimuth of arrival, shape (N, F, azimuths of `_ARRIVALS_RAD`)."""
+    """Return the power from every position by azimuth of arrival, (N, F, azimuths of `_ARRIVALS_RAD`)."""
     left, right, facade, _, screen_db, off_m = draw.tolist()
     arriving = np.zeros((len(along_m), len(frequencies_hz), len(_ARRIVALS_RAD)))
     every = np.arange(len(along_m))
     for part_m in PARTS_M:
         for path in sound_paths(walls, walls.crossing_m + off_m, along_m + part_m, frequencies_hz):
-            # A bent path is the one from which the corner takes more than half.
+            # A path counts as diffracted if the corner removes more than half of its power.
             bent = np.where(path.passed < 1.0 / 3.0, 10.0 ** (screen_db / 10.0), 1.0)
             at = np.rint(np.degrees(path.azimuth_rad)).astype(int) + 90
             arriving[every, :, at] += path.power(facade, left, right) * bent / len(PARTS_M)
@@ -342,13 +348,13 @@ def _arriving(
 def _responses(
     array: MicrophoneArray, frequencies_hz: FloatArray, azimuths_rad: FloatArray, waves_rad: FloatArray
 ) -> FloatArray:
-    r"""Beam power of plane waves, :math:`|a_f(\theta)^H a_f(\phi)|^2 / M^2`, shape (F, G, waves)."""
+    r"""Return the beam power of plane waves, :math:`|a_f(\theta)^H a_f(\phi)|^2 / M^2`, (F, G, waves)."""
     beams = array.steering(frequencies_hz, azimuths_rad).conj().transpose(0, 2, 1)
     return np.asarray(np.abs(beams @ array.steering(frequencies_hz, waves_rad)) ** 2 / array.n_microphones**2)
 
 
 def _metric(resolution: FloatArray) -> FloatArray:
-    """Symmetric root of the inverse of C, with what a constant becomes taken out."""
+    """Return the symmetric root of the inverse of C, without the component of a constant."""
     values, vectors = np.linalg.eigh(resolution)
     values = np.maximum(values, 0.0) + LEAST_RESOLVED * np.trace(resolution)
     root = (vectors / np.sqrt(values)) @ vectors.T

@@ -1,1 +1,1 @@
-"""Signatures of single clips: what tells a vehicle from background, and where it stops doing so."""
+"""Signatures of single clips: separability of vehicles and background, and its limits."""

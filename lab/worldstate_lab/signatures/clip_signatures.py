@@ -1,7 +1,7 @@
-"""Signatures of a corpus of clips: 16 log-energies each, what is known of the clip, and which bands tell it.
+"""Signatures of a corpus of clips: 16 log-energies each, the labels of the clip, and the informative bands.
 
-Source of the profile, one band at a time: R. A. Fisher, "The use of multiple measurements in taxonomic
-problems", 1936.
+Source of the profile, computed for one band at a time: R. A. Fisher, "The use of multiple measurements in
+taxonomic problems", 1936.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -22,10 +22,10 @@ from worldstate.operations.figure_style import legend_beside
 
 from .traffic_clips import BACKGROUND, ClipLabels, TrafficClip, read_clip
 
-# Bands end at whole bins of 512 samples, so clips of two rates would have different bands: all are brought
-# to the rate of the larger corpus first.
+# Band edges are whole bins of 512 samples, so clips with different rates would have different bands: all
+# clips are first resampled to the rate of the larger corpus.
 RATE_HZ = 48_000.0
-# The highest band ends at 8 kHz, where 0.45 of the sample rate must still reach.
+# The highest band ends at 8 kHz, which must not exceed 0.45 of the sample rate.
 LOWEST_RATE_HZ = 8000.0 / 0.45
 MOTOR_VEHICLES = ("car", "truck", "bus", "motorcycle")
 
@@ -36,22 +36,22 @@ _COLUMNS = ("energy", "kinds", "microphones", "recordings", "sites", "splits")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClipSignatures:
-    """One row a clip."""
+    """Signatures and labels, one row per clip."""
 
     name: str
     energy: FloatArray  # shape (n, 16): Log-energies
-    kinds: TextArray  # shape (n,), as the others: see `ClipLabels`
+    kinds: TextArray  # shape (n,), like the following fields: see `ClipLabels`
     microphones: TextArray
     recordings: TextArray
     sites: TextArray
     splits: TextArray
-    left_out: tuple[str, ...] = ()  # Why clips could not be heard
+    left_out: tuple[str, ...] = ()  # Reasons why clips could not be read
 
     @classmethod
     def of(
         cls, name: str, rows: Sequence[tuple[ClipLabels, FloatArray]], *, left_out: tuple[str, ...] = ()
     ) -> "ClipSignatures":
-        """Put clips one below the other."""
+        """Combine clips into one table."""
         singles = zip(_COLUMNS[1:], _OF_A_CLIP, strict=True)
         labels: dict[str, Any] = {to: np.array([getattr(one, of) for one, _ in rows]) for to, of in singles}
         return cls(name, np.array([energy for _, energy in rows]), left_out=left_out, **labels)
@@ -63,7 +63,7 @@ class ClipSignatures:
 
     @property
     def motor(self) -> BoolArray:
-        """Clips of the kinds that the roadside corpus has, from which signatures are learned."""
+        """Clips of the vehicle kinds in the roadside corpus, on which models are trained."""
         return np.isin(self.kinds, MOTOR_VEHICLES)
 
     def select(self, chosen: BoolArray | IndexArray) -> "ClipSignatures":
@@ -73,14 +73,15 @@ class ClipSignatures:
 
 @cache
 def signature_edges_hz() -> FloatArray:
-    """Return the edges of the 16 bands, shape (17,), which grow by an equal ratio from 50 Hz to 8 kHz."""
+    """Return the edges of the 16 bands, shape (17,), with a constant ratio from 50 Hz to 8 kHz."""
     return LevelMeter(1, RATE_HZ, FrontEndSettings()).edges_hz
 
 
 def signature(samples: Float32Array, rate_hz: float) -> FloatArray:
     """Return the log-energy of a clip (n, channels) in every band, shape (16,).
 
-    It is the logarithm of the mean over all frames and channels: a passage counts by its loudest moment.
+    It is the logarithm of the mean over all frames and channels, so the loudest moment of a passage
+    dominates.
     """
     if rate_hz != RATE_HZ:
         from scipy.signal import resample_poly
@@ -94,7 +95,7 @@ def signature(samples: Float32Array, rate_hz: float) -> FloatArray:
 def hear_clips(
     name: str, clips: Sequence[TrafficClip], jobs: int = 1, on_clip: Callable[[], None] = lambda: None
 ) -> ClipSignatures:
-    """Return the signatures of files; what is damaged is left out and named."""
+    """Return the signatures of files; damaged files are left out and listed."""
     rows, left_out = [], []
     for clip, heard in zip(clips, in_processes(_heard, clips, jobs), strict=True):
         if isinstance(heard, str):
@@ -103,7 +104,7 @@ def hear_clips(
             rows.append((clip.labels, heard))
         on_clip()
     if not rows:
-        raise InputFileError(name, f"expected clips that can be read; the first one: {left_out[0]}")
+        raise InputFileError(name, f"expected readable clips; the first one: {left_out[0]}")
     return ClipSignatures.of(name, rows, left_out=tuple(left_out))
 
 
@@ -126,20 +127,20 @@ class BandProfile:
     """Fisher ratio of every band between windows with a vehicle and without one."""
 
     edges_hz: FloatArray  # shape (B + 1,)
-    by_level: FloatArray  # shape (B,): Of the log-energies themselves
-    by_shape: FloatArray  # shape (B,): Of their shape, which gain and range do not change
-    range_hz: tuple[float, float]  # Around the best band of the shape: see `discriminative_range_hz`
+    by_level: FloatArray  # shape (B,): Of the log-energies
+    by_shape: FloatArray  # shape (B,): Of their shape, which does not change with gain or range
+    range_hz: tuple[float, float]  # Range around the best band by shape: see `discriminative_range_hz`
 
 
 def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArray) -> BandProfile:
-    """Compare the band levels of windows, samples (n, M) at a rate, with a vehicle and without one."""
-    # All windows need the bands of one rate: the first one's.
+    """Compare the band levels of windows, samples (n, M) at a rate, with and without a vehicle."""
+    # All windows use the bands of the first window's rate.
     rows, edges_hz = [], None
     for samples, rate_hz in windows:
         meter = LevelMeter(samples.shape[1], rate_hz, FrontEndSettings())
         edges_hz = meter.edges_hz if edges_hz is None else edges_hz
         if not np.array_equal(meter.edges_hz, edges_hz):
-            raise InvalidArgumentError(f"windows: expected one sample rate, got {rate_hz:g} Hz too")
+            raise InvalidArgumentError(f"windows: expected a single sample rate, got {rate_hz:g} Hz too")
         rows.append(meter.push(samples))
     if edges_hz is None:
         raise InvalidArgumentError("windows: expected at least two with a vehicle and two without")
@@ -147,13 +148,13 @@ def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArr
 
 
 def draw_band_profile(axes: "Axes", profile: BandProfile, shaded_hz: tuple[float, float]) -> None:
-    """Draw the ratios of a profile over its bands, a range shaded: that of the shape, or the paper's."""
+    """Draw the ratios of a profile over its bands, with a shaded range: that of the shape, or the paper's."""
     low, high = shaded_hz
     axes.axvspan(low, high, color="0.9", linewidth=0, label=f"{low:.0f}-{high:.0f} Hz")
     axes.stairs(profile.by_level, profile.edges_hz, label="level", baseline=None)
     axes.stairs(profile.by_shape, profile.edges_hz, label="shape", baseline=None)
     axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio,\nvehicle against none")
-    # Decades alone would leave a span of two of them with three labels.
+    # With ticks at decades only, a span of two decades would have three labels.
     axes.set_xlim(profile.edges_hz[0], profile.edges_hz[-1])
     axes.set_xticks([50, 100, 300, 1000, 1800, 4000, 8000], ["50", "100", "300", "1k", "1.8k", "4k", "8k"])
     axes.minorticks_off()
@@ -162,14 +163,14 @@ def draw_band_profile(axes: "Axes", profile: BandProfile, shaded_hz: tuple[float
 
 
 def profile_of(energy: FloatArray, vehicle: BoolArray, edges_hz: FloatArray) -> BandProfile:
-    """Compare log-energies (n, B) with a vehicle and without one."""
+    """Compare log-energies (n, B) with and without a vehicle."""
     shape = level_invariant_shape(energy)
     by_level, by_shape = (fisher_profile(one[vehicle], one[~vehicle]) for one in (energy, shape))
     return BandProfile(edges_hz, by_level, by_shape, discriminative_range_hz(by_shape, edges_hz))
 
 
 def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
-    r"""Remove the level from log band energies: what remains does not change with gain or range.
+    r"""Remove the level from log band energies: the result does not change with gain or range.
 
     .. math:: s_b = \ln E_b - \frac1B \sum_{b'} \ln E_{b'}
 
@@ -185,29 +186,29 @@ def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
 
 
 def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
-    r"""Fisher ratio of every band between two classes.
+    r"""Return the Fisher ratio of every band between two classes.
 
     .. math:: F_b = \frac{(\mu_{1b} - \mu_{0b})^2}{\sigma_{1b}^2 + \sigma_{0b}^2}
 
     Parameters
     ----------
     vehicle, background : (n, B), (m, B) float
-        One signature a row, for example of `level_invariant_shape`; at least two rows each.
+        One signature per row, for example from `level_invariant_shape`; at least two rows each.
 
     Returns
     -------
     (B,) float
-        >= 0, with unbiased variances; 0 where both classes are the same constant, infinite where two
-        constants differ.
+        >= 0, with unbiased variances; 0 if both classes are the same constant, infinite if they are
+        different constants.
 
     Raises
     ------
     InvalidArgumentError
-        On a wrong shape, too few rows or non-finite values.
+        If a shape is wrong, there are too few rows, or a value is not finite.
 
     Notes
     -----
-    Sampling lifts it: without any difference its mean is about 1/(2n) + 1/(2m).
+    Sampling adds a bias: without any difference the mean ratio is about 1/(2n) + 1/(2m).
 
     Examples
     --------
@@ -227,7 +228,7 @@ def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
 def discriminative_range_hz(
     profile: ArrayLike, edges_hz: ArrayLike, share: float = 0.5
 ) -> tuple[float, float]:
-    r"""Find the contiguous range of bands around the best one whose ratio is at least a share of it.
+    r"""Return the contiguous range of bands around the best one whose ratio is at least a share of its ratio.
 
     .. math:: F_b \ge s\, \max_{b'} F_{b'} \quad \text{for all bands } b \text{ of the range}
 

@@ -1,4 +1,4 @@
-"""Signature separability and its limits: section IX of the paper on whatever corpora are given."""
+"""Signature separability and its limits: section IX of the paper on the given corpora."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -20,15 +20,15 @@ from .clip_signatures import (
 )
 
 By = Literal["level", "shape"]
-# Fewer recordings of a class on either side tell nothing of the next one.
+# With fewer recordings of a class in training or test, the result does not generalise.
 LEAST = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClipScores:
-    """Scores of clips by a model that was trained on none of their recordings; positive means vehicle."""
+    """Scores of clips from a model trained on none of their recordings; positive means vehicle."""
 
-    score: FloatArray  # shape (n,): Log-odds at equal classes, as the others
+    score: FloatArray  # shape (n,), like the following fields: Log-odds with equal classes
     vehicle: BoolArray
     recordings: TextArray
     sites: TextArray
@@ -39,21 +39,21 @@ class ClipScores:
 
     @property
     def worst_site(self) -> tuple[str, float] | None:
-        """Where the area is smallest; None where there are not two places to compare."""
+        """Site with the smallest area; None if there are fewer than two sites."""
         areas = auroc_by_group(self.score, self.vehicle, self.sites)
         return min(areas.items(), key=lambda one: one[1]) if len(areas) > 1 else None
 
 
 def enough(table: ClipSignatures) -> bool:
-    """Whether both classes come from at least two recordings."""
+    """Return whether both classes come from at least two recordings."""
     return all(len(np.unique(table.recordings[one])) >= LEAST for one in (table.motor, table.background))
 
 
 def transferred(train: ClipSignatures, test: ClipSignatures, by: By) -> FloatArray:
     """Train on motor vehicles and background of one table; return the scores of another, shape (n,)."""
-    # Logistic regression, because a discriminant analysis assumes one covariance of both classes: on the
-    # simulated roads vehicles scatter by 4 dB in level and background by 2.5. Balanced, so that zero is the
-    # threshold of equal classes.
+    # Logistic regression, because discriminant analysis assumes equal covariances: on the simulated roads the
+    # level of vehicles varies by 4 dB and that of the background by 2.5. Balanced, so that zero is the
+    # threshold for equal classes.
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
@@ -62,14 +62,14 @@ def transferred(train: ClipSignatures, test: ClipSignatures, by: By) -> FloatArr
     logistic = LogisticRegression(class_weight="balanced", solver="newton-cholesky")
     machine = make_pipeline(StandardScaler(), logistic)
     machine.fit(_features(train.energy[used], by), train.motor[used])
-    # The log-odds and not the probability, which saturates at 1 and would tie clips that differ.
+    # Log-odds and not probabilities, which saturate at 1 and would give ties between different clips.
     return np.asarray(machine.decision_function(_features(test.energy, by)))
 
 
 def held_out(
     table: ClipSignatures, by: By, rng: np.random.Generator
 ) -> tuple[ClipSignatures, FloatArray, str]:
-    """Return the clips that were scored, their scores, and by which split."""
+    """Return the scored clips, their scores, and the name of the split."""
     train, test = table.select(table.splits == "train"), table.select(table.splits == "test")
     if enough(train) and enough(test):
         return test, transferred(train, test, by), "official split"
@@ -82,13 +82,13 @@ def held_out(
 
 
 def _folds(table: ClipSignatures, rng: np.random.Generator) -> IndexArray:
-    """Deal recordings to folds so that every fold can be learned without, shape (n,) of the clips."""
+    """Assign recordings to folds so that training without any fold is possible, shape (n,) of the clips."""
     names, of_clip = np.unique(table.recordings, return_inverse=True)
     held = [
         (table.motor[of_clip == i].any(), table.background[of_clip == i].any()) for i in range(len(names))
     ]
-    # Background alone, both, vehicles alone, neither: recordings of one class are neighbours, so two of them
-    # never fall into the same fold.
+    # Background only, both, vehicles only, neither: recordings of one class are adjacent, so two of them are
+    # never in the same fold.
     place = {(False, True): 0, (True, True): 1, (True, False): 2, (False, False): 3}
     draws = rng.random(len(names))
     order = sorted(range(len(names)), key=lambda i: (place[bool(held[i][0]), bool(held[i][1])], draws[i]))
@@ -98,19 +98,19 @@ def _folds(table: ClipSignatures, rng: np.random.Generator) -> IndexArray:
 
 
 def scores_of(table: ClipSignatures, score: FloatArray, positive: BoolArray) -> ClipScores:
-    """Keep what is to be told from background, and the background."""
+    """Keep the positive clips and the background."""
     whole = ClipScores(score, positive, table.recordings, table.sites)
     return whole.select(positive | table.background)
 
 
 def area(scores: ClipScores) -> float:
-    """Return the area under the ROC curve, NaN where a class is missing."""
+    """Return the area under the ROC curve, NaN if a class is missing."""
     found = auroc(scores.score, scores.vehicle)
     return float("nan") if found is None else found
 
 
 def balanced_accuracy(scores: ClipScores) -> float:
-    r"""Return the mean hit rate of both classes at the threshold of equal classes, NaN where one is missing.
+    r"""Return the mean hit rate of both classes at the threshold for equal classes, NaN if one is missing.
 
     .. math:: \tfrac12 \big(P(s^+ > 0) + P(s^- \le 0)\big)
     """
@@ -121,7 +121,7 @@ def balanced_accuracy(scores: ClipScores) -> float:
 
 
 def interval(figure: Callable[[ClipScores], float], scores: ClipScores, rng: np.random.Generator) -> Interval:
-    """Return the middle 95 % of a figure over draws of recordings with replacement."""
+    """Return the central 95 % of a figure over draws of recordings with replacement."""
     drawn = draw_recordings(scores.recordings, scores.vehicle, rng)
     return middle(np.array([figure(scores.select(some)) for some in drawn]))
 
@@ -135,7 +135,7 @@ def draw_recordings(
     """
     names, of_clip = np.unique(recordings, return_inverse=True)
     rows = [np.flatnonzero(of_clip == i) for i in range(len(names))]
-    # Drawn apart by what they hold, or a draw could be without any background.
+    # Stratified by the classes that a recording contains; otherwise a draw could lack the background.
     holds = [(bool(vehicle[one].any()), bool(vehicle[one].all())) for one in rows]
     return pooled_draws(rows, holds, rng)
 
@@ -154,8 +154,9 @@ BYS: tuple[By, By] = ("level", "shape")
 VEHICLE = "vehicle"
 ELECTRIC = "electric"
 QUIET = (ELECTRIC, "bicycle", "tram")
-NOWHERE = "neither corpus says which cars are electric"
-# Section IX of the paper. It gives one range for the shape and does not say which end is whose microphone's.
+NOWHERE = "neither corpus labels electric cars"
+# Section IX of the paper. It gives one range for the shape without stating which end belongs to which
+# microphone.
 PAPER = {
     ("level", "studio"): (0.999, 0.999),
     ("level", "mems"): (0.997, 0.997),
@@ -173,10 +174,11 @@ class SignatureRow:
     name: str
     corpus: str
     figure: str  # AUROC, balanced accuracy or Hz
-    value: float | None  # None where a corpus is missing or too small: the note says what would fill it
+    # None if a corpus is missing or too small: the note contains the command that computes it
+    value: float | None
     low: float | None = None  # Interval of 95 % over recordings
     high: float | None = None
-    paper: tuple[float, float] | None = None  # Ends of its range, equal where it gives one number
+    paper: tuple[float, float] | None = None  # Ends of its range, equal if the paper gives one number
     n_clips: int = 0
     note: str = ""
 
@@ -187,7 +189,7 @@ class SignatureStudy:
 
     rows: tuple[SignatureRow, ...]
     profile: BandProfile | None
-    left_out: tuple[str, ...]  # Why clips could not be heard
+    left_out: tuple[str, ...]  # Reasons why clips could not be read
 
 
 def signature_study(
@@ -196,9 +198,9 @@ def signature_study(
     rng: np.random.Generator,
     on_row: Callable[[], None] = lambda: None,
 ) -> SignatureStudy:
-    """Fill every row that the corpora allow, and say which command fills the others.
+    """Compute every row that the corpora allow, and list the commands that compute the others.
 
-    `roadside` has studio and MEMS microphones, `city` phones; either may be None.
+    `roadside` has studio and MEMS microphones, `city` has phones; either may be None.
     """
     given: dict[Corpus, ClipSignatures | None] = {IDMT: roadside, MELAUDIS: city}
     tables = {name: one for name, one in given.items() if one is not None}
@@ -216,10 +218,10 @@ def _rows(
     rng: np.random.Generator,
     on_row: Callable[[], None] = lambda: None,
 ) -> tuple[list[SignatureRow], list[SignatureRow]]:
-    """Return the rows of how well is told apart, and those of the Fisher profile."""
+    """Return the rows on separability, and those of the Fisher profile."""
     rows, scored = [], dict[tuple[str, ...], _Scored | None]()
     for question in QUESTIONS:
-        # Vehicles and quiet road users of a corpus are scored by one and the same model.
+        # Vehicles and quiet road users of a corpus are scored with the same model.
         key = question.by, question.train, question.test, question.microphone
         if key not in scored:
             scored[key] = _scored(question, tables, rng)
@@ -231,18 +233,18 @@ def _rows(
 
 @dataclass(frozen=True, slots=True)
 class _Question:
-    """What a row asks: what is to be told from background, by what, learned where, heard where."""
+    """Definition of a row: kind to separate from background, feature, training corpus, test corpus."""
 
     by: By
     train: Corpus
     test: Corpus
-    microphone: str = ""  # All of the corpus where none is named
+    microphone: str = ""  # All microphones of the corpus if empty
     kind: str = VEHICLE
     figure: str = "AUROC"
 
     @property
     def name(self) -> str:
-        how = f"{self.microphone} microphones" if self.microphone else "learned on the other corpus"
+        how = f"{self.microphone} microphones" if self.microphone else "trained on the other corpus"
         return f"{self.kind} by {self.by}, {how}"
 
     @property
@@ -251,10 +253,12 @@ class _Question:
 
 
 QUESTIONS = (
-    # The corpus that was learned from, other recordings; quiet road users by a model that never heard them.
+    # Training and test on different recordings of one corpus; quiet road users with a model that was not
+    # trained on them.
     *(_Question(by, IDMT, IDMT, microphone) for by in BYS for microphone in ("studio", "mems")),
     *(_Question(by, MELAUDIS, MELAUDIS, "phone", kind) for by in BYS for kind in (VEHICLE, *QUIET)),
-    # The other corpus; the accuracy shows a threshold that another gain has moved, which an area cannot.
+    # Test on the other corpus. The accuracy shows a shift of the threshold by another gain, which an area
+    # cannot show.
     *(_Question(by, *way, figure=figure) for by in BYS for way in BOTH_WAYS for figure in FIGURES),
     *(_Question("shape", IDMT, MELAUDIS, kind=kind) for kind in QUIET),
 )
@@ -262,7 +266,7 @@ QUESTIONS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:
-    """Clips, their scores, and how they were kept from the training."""
+    """Clips, their scores, and how the test clips were separated from the training."""
 
     table: ClipSignatures
     score: FloatArray
@@ -275,7 +279,7 @@ def _row(
     scored: _Scored | None,
     rng: np.random.Generator,
 ) -> SignatureRow:
-    """Answer a question; without a value where a corpus is missing or too small."""
+    """Return the row of a question; without a value if a corpus is missing or too small."""
     names = list(dict.fromkeys((question.train, question.test)))
     missing = [name for name in names if name not in tables]
     known = [name if missing else tables[name].name for name in names]
@@ -299,7 +303,7 @@ def _row(
 def _scored(
     question: _Question, tables: Mapping[Corpus, ClipSignatures], rng: np.random.Generator
 ) -> _Scored | None:
-    """Return the scores of a question's clips, None where a corpus is missing or too small."""
+    """Return the scores of a question's clips, None if a corpus is missing or too small."""
     train, test = tables.get(question.train), tables.get(question.test)
     if train is None or test is None:
         return None
@@ -309,7 +313,7 @@ def _scored(
         return None
     if question.microphone:
         return _Scored(*held_out(train, question.by, rng))
-    return _Scored(test, transferred(train, test, question.by), f"learned on all of {train.name}")
+    return _Scored(test, transferred(train, test, question.by), f"trained on all of {train.name}")
 
 
 def _range_rows(table: ClipSignatures | None, by: By, rng: np.random.Generator) -> list[SignatureRow]:
@@ -337,13 +341,13 @@ def _half_range_hz(table: ClipSignatures, by: By) -> tuple[float, float]:
 
 
 def _studio(table: ClipSignatures | None) -> ClipSignatures | None:
-    """Return motor vehicles and background as the better microphones heard them."""
+    """Return motor vehicles and background of the studio microphones."""
     if table is None:
         return None
     return table.select((table.microphones == "studio") & (table.motor | table.background))
 
 
 def command(*corpora: Corpus) -> str:
-    """Return the command that fills a row."""
+    """Return the command that computes a row."""
     given = (option for name, option in OPTIONS.items() if name in corpora)
     return " ".join(["worldstate-lab corpora", *given])

@@ -1,4 +1,4 @@
-"""Two-second clips of roadside traffic, of IDMT-Traffic and of MELAUDIS: where each lies, and its labels."""
+"""Two-second clips of roadside traffic, from IDMT-Traffic and MELAUDIS: their files and labels."""
 
 import re
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ from worldstate.ground.typing import Float32Array
 
 CLIP_S = 2.0
 BACKGROUND = "background"
-# IDMT-Traffic has 17,506 clips and MELAUDIS about 16,000: a folder with many times as many is another one.
+# IDMT-Traffic has 17,506 clips and MELAUDIS about 16,000: a folder with many times more is another data set.
 MAX_CLIPS = 200_000
-# As many names as a reader of the message can act on.
+# Maximum number of names in an error message.
 _NAMED = 8
 
 
 @dataclass(frozen=True, slots=True)
 class ClipLabels:
-    """What is known of a clip."""
+    """Labels of a clip."""
 
-    kind: str  # `BACKGROUND` or the kind of the one vehicle that passes
+    kind: str  # `BACKGROUND` or the kind of the single passing vehicle
     microphone: str  # "studio", "mems" or "phone"
-    recording: str  # Clips that share a day, a place and a background share it
+    recording: str  # The same for clips with the same day, place and background
     site: str
     split: str = ""  # "train" or "test" of an official split
 
@@ -49,14 +49,14 @@ def read_clip(clip: TrafficClip) -> tuple[Float32Array, float]:
 
 
 def _refuse_missing(root: Path, corpus: str, missing: Sequence[str]) -> None:
-    """Refuse a folder that lacks something, with a list of it; none missing is fine."""
+    """Raise an error that lists the missing parts of a folder, if there are any."""
     if missing:
         more = f" and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
         raise InputFileError(root, f"expected {corpus}; missing: {', '.join(missing[:_NAMED])}{more}")
 
 
 def _check_number(root: Path, clips: Sequence[object]) -> None:
-    """Refuse more clips than any of these corpora has."""
+    """Raise an error if there are more clips than any of these corpora has."""
     if len(clips) > MAX_CLIPS:
         raise InputFileError(root, f"expected at most {MAX_CLIPS} clips, got {len(clips)}")
 
@@ -74,7 +74,7 @@ _IDMT_NAME = re.compile(
 
 
 def idmt_traffic(root: str | Path) -> list[TrafficClip]:
-    """List the clips of the data set; refuse a folder that lacks a list or any of the sound that it names.
+    """List the clips of the data set; raise an error if a list or any listed sound file is missing.
 
     IDMT-Traffic: passing vehicles at four roads, recorded with studio and with MEMS microphones.
 
@@ -82,14 +82,14 @@ def idmt_traffic(root: str | Path) -> list[TrafficClip]:
     EUSIPCO 2021; doi:10.5281/zenodo.7551553. The layout is that of its readme and of its import script,
     ``annotation/import_idmt_traffic_dataset.py``::
 
-        <root>/annotation/idmt_traffic_all.txt      one file name a line, 17,506 of them
+        <root>/annotation/idmt_traffic_all.txt      one file name per line, 17,506 of them
         <root>/annotation/eusipco_2021_train.txt    the official split
         <root>/annotation/eusipco_2021_test.txt
         <root>/audio/<name>.wav                     2 s, two channels, 48 kHz
 
-    A name holds date and time, location, speed limit, middle of the clip in samples of its recording, time of
-    day (M, A), road (D dry, W wet), vehicle (B bus, C car, M motorcycle, T truck) with the side that it comes
-    from (L, R), microphone (SE sE8 studio, ME ICS-43434 MEMS) and channel pair::
+    A name contains date and time, location, speed limit, centre of the clip in samples of its recording, time
+    of day (M, A), road (D dry, W wet), vehicle (B bus, C car, M motorcycle, T truck) with the side from which
+    it comes (L, R), microphone (SE sE8 studio, ME ICS-43434 MEMS) and channel pair::
 
         2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_1272258_M_D_CR_ME_CH12.wav
         2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_10077440_SE_CH34-BG.wav       without a vehicle
@@ -100,7 +100,7 @@ def idmt_traffic(root: str | Path) -> list[TrafficClip]:
     _refuse_missing(folder, "IDMT-Traffic (audio/*.wav and annotation/*.txt)", missing)
     names = _names(folder / "annotation" / ALL_NAME)
     _check_number(folder, names)
-    # One look into the folder: 17,506 questions to a network disk take minutes.
+    # One listing of the folder: 17,506 separate queries to a network disk take minutes.
     there = {path.name for path in (folder / "audio").glob("*.wav")}
     missing = [f"audio/{name}" for name in names if name not in there]
     _refuse_missing(folder, f"the {len(names)} clips of annotation/{ALL_NAME}", missing)
@@ -118,39 +118,40 @@ def _names(path: Path) -> list[str]:
     lines = read_text(path, "a list of file names", _MAX_BYTES).splitlines()
     names = [line.strip().removesuffix(".wav") + ".wav" for line in lines if line.strip()]
     if not names:
-        raise InputFileError(path, "expected one file name a line, the list is empty")
+        raise InputFileError(path, "expected one file name per line, the list is empty")
     return names
 
 
 def _idmt_labels(folder: Path, name: str, split: str) -> ClipLabels:
     found = _IDMT_NAME.fullmatch(name.removesuffix(".wav"))
-    # A clip is either of a vehicle or of the background; a name that says both or neither is no label.
+    # A clip is either of a vehicle or of background; a name with both or neither is invalid.
     if found is None or (found["vehicle"] is None) == (found["background"] is None):
         problem = f"expected a name such as ..._30Kmh_1272258_M_D_CR_ME_CH12.wav, got {name[:100]!r}"
         raise InputFileError(folder / "annotation" / ALL_NAME, problem)
     kind = BACKGROUND if found["vehicle"] is None else VEHICLES[found["vehicle"]]
-    # Both microphones heard the same passage: they share a recording, so that no fold parts them.
+    # Both microphones recorded the same passage: they share a recording, so that no fold separates them.
     recording = f"{found['stamp']}_{found['site']}_{found['limit']}"
     return ClipLabels(kind, MICROPHONES[found["microphone"]], recording, found["site"], split)
 
 
 VEHICLES_NAME, BACKGROUND_NAME = "MELAUDIS_Vehicles", "MELAUDIS_BG"
 KINDS = {"Car": "car", "Truck": "truck", "Bus": "bus", "MC": "motorcycle", "Tram": "tram", "Bic": "bicycle"}
-# Neighbouring clips of a long recording say the same; so many of them, evenly apart, tell its spread.
+# Neighbouring clips of a long recording are similar; this many, evenly spaced, represent its variation.
 CLIPS_A_FILE = 20
-# Minutes of 60 to 62 occur: the time is not read as one.
+# Minutes of 60 to 62 occur, so the time is not parsed.
 _WHERE = r"(?P<date>\d{4}-\d{2}-\d{2})_\d+-\d+-[\d.]+-(?P<place>[A-Za-z]+)(?P<spot>\d*[A-Za-z]?)"
 _MELAUDIS_NAME = re.compile(
     _WHERE + r"_(?P<state>[A-Z]+)_(?P<what>NoV|\dV-\w+?)(?:_\w+)?_(?:mono|stereo)",
     re.ASCII,
 )
-# A stray file does no harm; many are a release with other names, of which a part would be used unsaid.
+# A single stray file is harmless. Many indicate a release with other names, of which only a part would be
+# used without notice.
 _MOST_UNREAD = 0.01
 _BEGINNING = re.compile(_WHERE + r"(?![A-Za-z\d])", re.ASCII)
 
 
 def melaudis(root: str | Path) -> list[TrafficClip]:
-    """List the clips of one vehicle in free flow and those of the background; refuse a partial folder.
+    """List the clips of one vehicle in free flow and of the background; raise an error for a partial folder.
 
     MELAUDIS: vehicles in the streets of Melbourne, recorded with phones on the pavement.
 
@@ -161,15 +162,16 @@ def melaudis(root: str | Path) -> list[TrafficClip]:
         <root>/MELAUDIS_Vehicles/**/<name>.wav    two seconds around a passage, 13,668 of them
         <root>/MELAUDIS_BG/**/<name>.wav          without a vehicle
 
-    The data descriptor ("Data Features") says what the name of a vehicle clip holds: date, time and place,
-    state of the traffic (FF free flow, TJN and TJF jams), number and kind of vehicles, lanes, direction, and
-    mono or stereo, which tells the two models of phone apart::
+    According to the data descriptor ("Data Features"), the name of a vehicle clip contains date, time and
+    place, state of the traffic (FF free flow, TJN and TJF jams), number and kind of vehicles, lanes,
+    direction, and mono or stereo, which distinguishes the two models of phone::
 
         2024-02-09_13-0-1.8-Fitzroy1_FF_1V-Car_2Lanes_LR_stereo.wav
 
     Only free flow with one vehicle is used (1V-Car, -Truck, -Bus, -MC, -Tram, -Bic), and NoV as background.
-    How the files of MELAUDIS_BG are named is not documented: any WAV there is background, cut into clips
-    where it is longer, of the day and place with which its name begins, else a recording of its own.
+    The names of the files in MELAUDIS_BG are not documented: every WAV there is background and is cut into
+    clips if it is longer. If its name begins with a day and a place, these define its recording; otherwise
+    the file is a recording of its own.
     """
     folder = Path(root)
     found = {name: sorted((folder / name).rglob("*.wav")) for name in (VEHICLES_NAME, BACKGROUND_NAME)}
@@ -187,7 +189,7 @@ def melaudis(root: str | Path) -> list[TrafficClip]:
 
 
 def _vehicle_clips(path: Path, found: re.Match[str]) -> list[TrafficClip]:
-    """Return the clip of a file; none where it holds a jam or several vehicles."""
+    """Return the clip of a file; empty if it contains a jam or several vehicles."""
     single = KINDS.get(found["what"].removeprefix("1V-"))
     kind = BACKGROUND if found["what"] == "NoV" else single
     if kind is None or found["state"] != "FF":
@@ -196,8 +198,8 @@ def _vehicle_clips(path: Path, found: re.Match[str]) -> list[TrafficClip]:
 
 
 def _melaudis_labels(kind: str, found: re.Match[str]) -> ClipLabels:
-    # Start and end of the original recordings are not published. A day at a spot is the least that shares
-    # its background, so what is learned on one clip of it is not tested on the next.
+    # Start and end of the original recordings are not published. Clips of one day and spot share a
+    # background, so they are never divided between training and test.
     return ClipLabels(kind, "phone", f"{found['date']}_{found['place']}{found['spot']}", found["place"])
 
 
@@ -206,7 +208,7 @@ def _background_clips(root: Path, path: Path) -> list[TrafficClip]:
         with open_audio(path, strict=False) as source:
             last_s = max(source.duration_s - CLIP_S, 0.0)
     except InputFileError:
-        return [TrafficClip(path, _background(root, path))]  # which is reported when it is read
+        return [TrafficClip(path, _background(root, path))]  # an error is raised when it is read
     starts = np.linspace(0.0, last_s, min(int(last_s // CLIP_S) + 1, CLIPS_A_FILE))
     return [TrafficClip(path, _background(root, path), start_s) for start_s in starts.tolist()]
 

@@ -293,7 +293,7 @@ def _with_mean(by_site: Mapping[str, float]) -> dict[str, float]:
 
 
 def position_rows(figures: Mapping[str, Mapping[FigureKey, float]]) -> list[RealismRow]:
-    """Return the loss with permuted positions; there is no real counterpart, because no real sound is released."""
+    """Return the loss with permuted positions; it has no real counterpart, because no sound is released."""
     keys = dict.fromkeys(key for one in figures.values() for key in one)
     return [
         RealismRow(*key, None, None, None, None, {name: one[key] for name, one in figures.items()})
