@@ -1,1 +1,1 @@
-"""Costs and accuracies of parts of the library, beside peers."""
+"""Costs and accuracies of parts of the library, compared with peers."""

@@ -1,11 +1,11 @@
-"""What a hop costs, stage by stage, in the real front-end and evidence, and what peers cost beside it.
+"""Processing time of a hop, stage by stage, in the real front-end and evidence, and that of peers.
 
-Every stage is timed where it is called: its function is replaced by one with a clock around it, so that no
-chain is repeated here. The window model is the one that ships. Trees and guard are made up, of the sizes that
-`worldstate model make` trains: what they cost does not depend on what they have learned. `published_chain`
-restates the chain of the published acoustic baseline in its amortised form: scipy's STFT of the whole file,
-channel by channel, its cost shared among the hops; then for every hop two segments of half a second through
-pyroomacoustics' SRP, thirty azimuths, 50-1500 Hz.
+Every stage is timed in place: its function is wrapped with a clock, so that the chain is not repeated here.
+The window model is the shipped one. Trees and guard are random, with the sizes that `worldstate model make`
+trains, because their time does not depend on the training. `published_chain` implements the published
+acoustic baseline in its amortised form: scipy's STFT of the whole file, channel by channel, with its time
+shared among the hops; then, for every hop, two segments of half a second through pyroomacoustics' SRP with
+thirty azimuths, 50-1500 Hz.
 """
 
 import time
@@ -57,11 +57,11 @@ EVIDENCE: Stages = {
     "domain_guard": ((DomainGuard, "judge"),),
     "sequence_reader": ((acoustic, "read_hop"),),
 }
-"""Parts of `evidence`, which also asks no camera and weighs the bearing."""
+"""Parts of `evidence`, which also includes the (empty) camera query and the weighting by bearing."""
 
 
 def elapsed_ms(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """Return how long `call` took, milliseconds: by the wall, or by the processor (`time.process_time`).
+    """Return the duration of `call` in milliseconds, wall time or processor time (`time.process_time`).
 
     Examples
     --------
@@ -74,7 +74,7 @@ def elapsed_ms(call: Callable[[], object], clock: Callable[[], float] = time.per
 
 
 def stage_times(stages: Stages, calls: Sequence[Callable[[], object]]) -> dict[str, Milliseconds]:
-    """Return the milliseconds that every stage takes within each call.
+    """Return the time of every stage within each call, in milliseconds.
 
     Examples
     --------
@@ -94,7 +94,7 @@ def stage_times(stages: Stages, calls: Sequence[Callable[[], object]]) -> dict[s
 
 @contextmanager
 def _clocks(stages: Stages, spent: dict[str, float]) -> Iterator[None]:
-    """Let every stage add its milliseconds to `spent`."""
+    """Make every stage add its milliseconds to `spent`."""
     with ExitStack() as patches:
         for name, functions in stages.items():
             for owner, function in functions:
@@ -119,7 +119,7 @@ REPEATS = 9
 
 
 def published_chain_times(sound: Float32Array, array: MicrophoneArray) -> Milliseconds:
-    """Return milliseconds per hop of the published chain on a sound of an array, shape (n, M)."""
+    """Return milliseconds per hop of the published chain on sound of an array, shape (n, M)."""
     import pyroomacoustics
     from scipy.signal import stft
 
@@ -140,13 +140,13 @@ def published_chain_times(sound: Float32Array, array: MicrophoneArray) -> Millis
 
 
 _FOREIGN, _SIGNALS = 9, 4
-_ROWS, _WINDOWS = 150, 40  # Few: the peers' cost does not depend on them either
+_ROWS, _WINDOWS = 150, 40  # Few: the peers' time does not depend on them either
 
 
 def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:
     """Time the evidence and its parts on every frame, and two peers."""
-    # A limit holds for libraries that are loaded. On a busy machine two threads wait for one another at every
-    # one of 900 small trees, for minutes.
+    # A thread limit applies only to loaded libraries. On a busy machine, two threads would wait for one
+    # another at each of 900 small trees, for minutes.
     import sklearn.ensemble  # noqa: F401
 
     with threadpool_limits(1):
@@ -154,7 +154,7 @@ def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:
         trees, rows = _peer_trees(rng), rng.normal(size=(REPEATS, 2, len(INPUTS)))
         whole, interpret = [elapsed_ms(one) for one in _interpreted(frames, rng)], _interpreted(frames, rng)
         times = stage_times(EVIDENCE, interpret) | {"evidence": whole}
-        # Before, trees are not asked.
+        # Before these hops the trees are not evaluated.
         times = {name: spent[LEAST_HOPS:] for name, spent in times.items()}
         classify, window = _peer_classifier(rng).decision_function, frames[-1].feature[None]
         times["scikit_learn_trees"] = [elapsed_ms(partial(trees.predict_proba, two)) for two in rows]
@@ -168,7 +168,7 @@ def _interpreted(frames: Sequence[AcousticFrame], rng: np.random.Generator) -> l
 
 
 def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
-    """Return an adapter with the window model that ships, and trees and a guard of no meaning."""
+    """Return an adapter with the shipped window model, random trees and a random guard."""
     signature = SiteSignature(read_model().signature)  # type: ignore[arg-type]
     reader = SequenceReader(_sequence(rng))
     return AcousticAdapter(
@@ -176,13 +176,13 @@ def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
     )
 
 
-# As many trees as a model of a standing ego has, all as large as its largest.
+# As many trees as a model for a standing ego has, each as large as its largest.
 _ROUNDS, _LEAVES = sum(one.rounds for one in STANDING), max(one.leaves for one in STANDING)
 
 
 def _sequence(rng: np.random.Generator) -> SequenceModel:
-    """Grow trees leaf by leaf as boosting does: the deepest decides what a walk takes."""
-    # A round is a tree for each group.
+    """Grow trees leaf by leaf as in boosting: the deepest path determines the time."""
+    # A round has one tree per group.
     trees, nodes = _ROUNDS * len(GROUPS), 2 * _LEAVES - 1
     yes, no = np.tile(np.arange(nodes), (2, trees, 1))
     for tree in range(trees):
@@ -212,7 +212,7 @@ def _peer_trees(rng: np.random.Generator) -> Any:
 
 
 def _peer_classifier(rng: np.random.Generator) -> Any:
-    """Return the published pipeline: standardised, linear machines pair by pair."""
+    """Return the published pipeline: standardisation, then linear machines for all pairs."""
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
     from sklearn.svm import SVC
@@ -230,6 +230,6 @@ def _guard(rng: np.random.Generator) -> DomainGuard:
         signals=tuple(f"signal {i}" for i in range(_SIGNALS)),
         weights=0.01 * rng.normal(size=(classes, inputs)),
         biases=np.zeros(classes),
-        # Everything is looked at more closely, which costs most.
+        # Every hop gets the closer analysis, which is the most expensive case.
         threshold=-1e3,
     )

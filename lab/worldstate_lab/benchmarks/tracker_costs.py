@@ -1,12 +1,12 @@
-"""What an update of the world-state costs beside a plain numpy batch and Stone Soup's JPDA.
+"""Processing time of a world-state update, compared with a numpy batch and Stone Soup's JPDA.
 
-The batch is the least that a tracker does: predict and update of n Kalman filters of four states and two
-measurements, their association known, by einsum.
+The batch is the minimum work of a tracker: predict and update n Kalman filters with four states and two
+measurements, with known association, by einsum.
 
-Stone Soup's GM-PHD and JPDA over azimuths, of peaks of a microphone array and boxes of a camera, get what
-their books ask for: detection probability and clutter of either sensor, a nearly constant rate of turn, and
-the sector that the camera searches. In Stone Soup the probability of detection is one number, so that a
-target outside that sector is kept from the camera's scan.
+Stone Soup's GM-PHD and JPDA filters over azimuth use peaks of a microphone array and boxes of a camera. They
+receive the parameters of their theory: detection probability and clutter of each sensor, a nearly constant
+turn rate, and the sector that the camera searches. In Stone Soup the detection probability is a single
+number, so a target outside that sector is excluded from the camera's scan.
 """
 
 import time
@@ -46,16 +46,16 @@ try:
 except ImportError as error:
     raise MissingExtraError("stonesoup", "oracles") from error
 
-# A peak belongs to a hidden vehicle in one of four windows, as the filter has it; the other three, and
-# every peak of an empty street, lie anywhere ahead.
+# A peak comes from a hidden vehicle in one of four windows, as in the filter. In the other three, and in an
+# empty street, its direction is uniform ahead.
 PEAK_DETECTION, PEAK_CLUTTER = 0.25, 1.0 / np.pi
 BOX_DETECTION, BOX_CLUTTER = 0.94, 0.01
 TURN_PSD = 0.014  # 2 m^2/s^3 at 12 m, rad^2/s^3
 START_STD, START_RATE_STD = 0.7, 0.4  # Ahead within 80 degrees; 5 m/s at 12 m
-END_STD = 0.1  # Of the ends of the view: half the width of a car at 9 m
-BIRTHS = 0.01  # A hop: one vehicle in ten seconds
-HITS = 3  # Boxes that make a track, as OC-SORT has it
-MISSED_S, UNSEEN_S = 0.35, 3.0  # Without a box where the camera looks, and in any case
+END_STD = 0.1  # At the ends of the view: half the width of a car at 9 m
+BIRTHS = 0.01  # Per hop: one vehicle in ten seconds
+HITS = 3  # Boxes that confirm a track, as in OC-SORT
+MISSED_S, UNSEEN_S = 0.35, 3.0  # Without a box while the camera searches there, and in any case
 _EPOCH = datetime(2000, 1, 1)
 _TURN = CombinedLinearGaussianTransitionModel([ConstantVelocity(TURN_PSD)])
 _PREDICTOR, _UPDATER = KalmanPredictor(_TURN), KalmanUpdater(None)
@@ -71,12 +71,12 @@ class SensorScan:
     sector_rad: tuple[float, float]  # From right to left: no target is searched for outside
 
     def searches(self, state: Any) -> bool:
-        """Tell whether a target is believed in the sector."""
+        """Return whether the estimated target is in the sector."""
         return bool(self.sector_rad[0] <= float(state.state_vector[0]) <= self.sector_rad[1])
 
 
 def scans(measurement: Measurement, view_rad: tuple[float, float]) -> tuple[SensorScan, SensorScan]:
-    """Return what the array and what the camera measured at a hop."""
+    """Return the detections of the array and of the camera at a hop."""
     when = scan_time(measurement)
     heard = [measurement.bearing] if isinstance(measurement.bearing, Bearing) else []
     view = max(view_rad[1] - view_rad[0], 0.1)
@@ -87,7 +87,7 @@ def scans(measurement: Measurement, view_rad: tuple[float, float]) -> tuple[Sens
 
 
 def scan_time(measurement: Measurement) -> datetime:
-    """Return the time of a measurement as Stone Soup has times."""
+    """Return the time of a measurement as a `datetime`, as Stone Soup requires."""
     return _EPOCH + timedelta(microseconds=measurement.stamp_ns // 1000)
 
 
@@ -99,10 +99,10 @@ def _detected(found: Iterable[Bearing | Sighting], when: datetime) -> tuple[Any,
 
 
 class GmPhd:
-    """The Gaussian-mixture PHD filter: azimuths of the components that weigh more than a half.
+    """The Gaussian-mixture PHD filter: azimuths of the components with a weight above one half.
 
-    Vehicles are born anywhere ahead, or at the ends of the view, where they come out of hiding, if these are
-    given (J. Menezes and M. Campbell, arXiv 2605.20666, without its semantic part).
+    Vehicles are born anywhere ahead or, if the ends of the view are given, there, where they come into view
+    (J. Menezes and M. Campbell, arXiv 2605.20666, without its semantic part).
     """
 
     def __init__(self, ends_rad: Sequence[float] = ()) -> None:
@@ -115,8 +115,8 @@ class GmPhd:
         self._components: list[Any] = []
 
     def step(self, scans: Iterable[SensorScan], when: datetime) -> list[float]:
-        """Take the scans of a hop."""
-        # Stone Soup asks for survival at every update: once a hop, not once a sensor.
+        """Process the scans of a hop."""
+        # Stone Soup applies survival at every update, but it must apply once per hop, not once per sensor.
         for scan, survival in zip(scans, (0.99, 1.0), strict=True):
             searched = [one for one in self._components if scan.searches(one)]
             others = [one for one in self._components if not scan.searches(one)]
@@ -145,10 +145,10 @@ class GmPhd:
 
 
 class Jpda:
-    """Joint probabilistic data association: azimuths of its tracks, which only boxes begin and keep alive."""
+    """Joint probabilistic data association: azimuths of its tracks, which only boxes start and keep alive."""
 
-    # Peaks stand somewhere at every hop: with them, a first one would be a track and never end, since JPDA
-    # has no existence.
+    # Every hop has a peak: if peaks could start tracks, the first one would never end, because JPDA has no
+    # existence probability.
     def __init__(self) -> None:
         nearest = GNNWith2DAssignment(
             DistanceHypothesiser(_PREDICTOR, _UPDATER, Mahalanobis(), missed_distance=4.0)
@@ -160,7 +160,7 @@ class Jpda:
         self._seen: dict[Any, datetime] = {}
 
     def step(self, scans: Iterable[SensorScan], when: datetime) -> list[float]:
-        """Take the scans of a hop."""
+        """Process the scans of a hop."""
         peaks, boxes = scans
         self._associated(peaks, when)
         named = self._associated(boxes, when)
@@ -173,7 +173,7 @@ class Jpda:
         return [float(track.state_vector[0]) for track in self._seen]
 
     def _associated(self, scan: SensorScan, when: datetime) -> set[Any]:
-        """Update the tracks by a scan; return the detections that are likelier theirs than not."""
+        """Update the tracks with a scan; return the detections that are more likely assigned than not."""
         tracks = {track for track in self._seen if scan.searches(track)}
         hypothesiser = PDAHypothesiser(
             _PREDICTOR, _UPDATER, scan.clutter_density, scan.detection_probability, prob_gate=0.999
@@ -191,13 +191,13 @@ class Jpda:
 
 
 ENTITIES = 1, 20
-CROWD = 64, 600  # Boxes an image; the filter counts 64
-HOPS, WARM_UP = 40, 20  # Once tracks are known
-_SILENT, _EVEN = NotUsable("not listened to"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+CROWD = 64, 600  # Boxes per image; the filter accepts 64
+HOPS, WARM_UP = 40, 20  # After tracks are established
+_SILENT, _EVEN = NotUsable("not measured"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 
 
 def tracker_times(rng: np.random.Generator) -> dict[str, Milliseconds]:
-    """Return the milliseconds of processor time of every hop, of every method and number of entities."""
+    """Return the processor time of every hop in milliseconds, by method and number of entities."""
     times = dict[str, Milliseconds]()
     for n in (*ENTITIES, *CROWD):
         times[f"update_{n}"], times[f"state_{n}"] = _world_times(hops(n, rng))
@@ -208,9 +208,9 @@ def tracker_times(rng: np.random.Generator) -> dict[str, Milliseconds]:
 
 
 def hops(n: int, rng: np.random.Generator) -> list[Measurement]:
-    """Return hops in which a camera finds the same n vehicles, side by side."""
+    """Return hops in which a camera detects the same n vehicles, side by side."""
     stand = np.linspace(-0.5, 0.5, n) if n > 1 else np.zeros(1)
-    # As far apart as the deviations of their boxes allow.
+    # The vehicles are as far apart as the standard deviations of their boxes permit.
     std = min(0.02, 0.2 / n)
     azimuth_rad = stand + rng.normal(0.0, 0.25 * std, (HOPS, n))
     return [

@@ -1,8 +1,8 @@
 """Evaluation of a signature classifier and its cueing on labelled feature windows.
 
-Everything that is scored was predicted by a classifier, a threshold and a risk map that saw no window of the
-recording (protocol ``cv``), junction (``lojo``) or kind of driving (``transfer``): threshold and map come
-from inner out-of-fold scores of the training windows.
+Every scored prediction comes from a classifier, a threshold and a risk map that were trained without any
+window of the recording (protocol ``cv``), junction (``lojo``) or ego motion (``transfer``). Threshold and map
+are set on inner out-of-fold scores of the training windows.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ from worldstate_lab.features.published_classifier import Classifier
 
 Protocol = Literal["cv", "lojo", "transfer"]
 Reference = Literal["run", "cold", "curated"]
-# Posteriors of the chosen rows of the table that is evaluated, shape (rows, 4).
+# Returns the posteriors of the chosen rows of the evaluated table, shape (rows, 4).
 Ask = Callable[[Classifier, BoolArray], FloatArray]
 
 SMALLEST_RISK = 1e-6
@@ -46,21 +46,21 @@ SMALLEST_RISK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class WindowMethod:
-    """One way from windows to risk."""
+    """One way to compute a risk from windows."""
 
-    make: Callable[[np.random.Generator], Classifier]  # Makes an untrained classifier
-    # What the scored windows are compared with, None where the method compares with nothing. Training is the
-    # same in any case, as in `model fit`.
+    make: Callable[[np.random.Generator], Classifier]  # Returns an untrained classifier
+    # Reference of the scored windows, None if the method uses none. Training is the same in any case, as in
+    # `model fit`.
     reference: Reference | None = None
-    # Whether it is made for sites unlike those of training: threshold and map come from folds like the outer
-    # ones alone, and under `transfer` risks are shifted until hazards are as frequent as in training. Else
-    # the threshold of an ensemble stands between junctions left out and recordings left out.
+    # Whether it is for sites unlike those of training. Then threshold and map come only from folds like the
+    # outer ones, and under `transfer` risks are shifted until hazards are as frequent as in training.
+    # Otherwise the threshold of an ensemble is a compromise between folds by junction and folds by recording.
     afar: bool = False
-    # How it is trained, where windows and labels are not all that it takes; `make` otherwise.
+    # Training function, if it needs more than windows and labels; otherwise `make` is used.
     fit: Callable[[FeatureTable], Classifier] | None = None
 
     def prepare(self, table: FeatureTable) -> FeatureTable:
-        """Return the table that the classifier sees, of the table as read."""
+        """Return the table in the form that the classifier receives."""
         return table if self.reference is None else with_site_references(table)
 
     def trained(self, table: FeatureTable, rng: np.random.Generator) -> Classifier:
@@ -70,21 +70,21 @@ class WindowMethod:
         return self.make(rng).fit(table.features, table.labels, table.environments)
 
     def posteriors(self, table: FeatureTable, rng: np.random.Generator, inner: Protocol = "cv") -> FloatArray:
-        """Return posteriors of each window of a prepared table out of fold, shape (n, 4)."""
+        """Return out-of-fold posteriors of each window of a prepared table, shape (n, 4)."""
         return self.passes(table, rng, inner, self.asks(table, rng)[:1])[0]
 
     def passes(
         self, table: FeatureTable, rng: np.random.Generator, inner: Protocol, asks: Sequence[Ask]
     ) -> list[FloatArray]:
-        """Return posteriors out of fold for each way to ask, each of shape (n, 4)."""
+        """Return out-of-fold posteriors for each kind of query, each of shape (n, 4)."""
         folds = folds_of(inner, table, rng)
         return out_of_fold(table, folds, lambda part: self.trained(part, rng), asks)
 
     def asks(self, table: FeatureTable, rng: np.random.Generator) -> list[Ask]:
-        """Return how inner folds of a prepared table are asked: compared as the scored windows are."""
-        # Thresholds of windows compared as under `run` cost .06 of the windows where the scored ones are
-        # compared with curated ones: a threshold holds for the reference that it was set under. Generators
-        # of their own: what is drawn to ask moves no fold.
+        """Return the queries of inner folds of a prepared table, with the reference of the scored windows."""
+        # A threshold is valid only for the reference with which it was set: one set under `run` loses 0.06 of
+        # the windows if the scored windows use curated references. Separate generators are used, so that the
+        # draws of queries do not change the folds.
         if self.afar or self.reference in (None, "curated"):
             return [_asked_plainly(table)]
         if self.reference == "run":
@@ -97,7 +97,7 @@ class WindowMethod:
     ) -> dict[float, tuple[WindowCalibration, float]]:
         """Return threshold, risk map and the mean risk of the training windows, for each beta."""
         like_outer: Protocol = "cv" if protocol == "cv" else "lojo"
-        # From the most careful to the boldest.
+        # From the most cautious to the least cautious.
         both = self.reference is not None and not self.afar and like_outer == "lojo"
         inner: tuple[Protocol, ...] = ("lojo", "cv") if both else (like_outer,)
         asks = self.asks(train, rng)
@@ -117,7 +117,7 @@ def folds_of(protocol: Protocol, table: FeatureTable, rng: np.random.Generator) 
 
 
 def _asked_plainly(table: FeatureTable) -> Ask:
-    """Ask for rows as the table holds them."""
+    """Return a query that uses the rows of the table unchanged."""
     return lambda classifier, rows: classifier.predict_proba(table.features[rows])
 
 
@@ -128,7 +128,7 @@ def _of_ensemble(ask: Callable[[EnsembleModel, BoolArray], FloatArray]) -> Ask:
 def asked_under(
     reference: Reference, table: FeatureTable, rng: np.random.Generator
 ) -> Callable[[EnsembleModel, BoolArray], FloatArray]:
-    """Return what gives the posteriors of rows by a model, compared with a reference.
+    """Return a function for the posteriors of rows by a model, with a reference.
 
     Shapes: table (n, 60).
     """
@@ -140,22 +140,22 @@ def asked_under(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predictions:
-    """What was predicted of every window of one table, each once."""
+    """Predictions for every window of one table, one each."""
 
     folds: TextArray  # shape (n,): Fold in which each window was held out
     probabilities: FloatArray  # shape (n, 4): Posteriors of front, left, none, right
-    score: FloatArray  # shape (n,): Statistic and calibrated risk
+    score: FloatArray  # shape (n,): Statistic; below, the calibrated risk
     risk: FloatArray
     decision: BoolArray  # shape (n,): Whether the statistic reached the threshold
 
     @classmethod
     def blank(cls, folds: TextArray) -> "Predictions":
-        """Return arrays to be filled in, fold by fold."""
+        """Return empty arrays to be filled in, fold by fold."""
         n = len(folds)
         return cls(folds, np.empty((n, len(CLASSES))), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_))
 
     def fill(self, rows: BoolArray, probabilities: FloatArray, calibration: WindowCalibration) -> None:
-        """Write what a calibration makes of the posteriors of some rows."""
+        """Store score, risk and decision of some rows, computed from their posteriors by a calibration."""
         self.probabilities[rows] = probabilities
         self.score[rows], self.risk[rows], self.decision[rows] = calibration.apply(probabilities)
 
@@ -163,7 +163,7 @@ class Predictions:
     def of_model(
         cls, probabilities: FloatArray, calibration: WindowCalibration, fold: str = "model"
     ) -> "Predictions":
-        """Return the predictions of a finished model, as one fold.
+        """Return the predictions of a trained model, as one fold.
 
         Shapes: probabilities (n, 4).
         """
@@ -173,7 +173,7 @@ class Predictions:
 
     @property
     def classes(self) -> TextArray:
-        """Most probable class of each window: the published rule."""
+        """Return the most probable class of each window: the published rule."""
         most_probable: TextArray = np.array(CLASSES)[self.probabilities.argmax(axis=1)]
         return most_probable
 
@@ -187,11 +187,11 @@ def evaluate_pass(
     alpha: float,
     train: FeatureTable | None = None,
 ) -> dict[float, Predictions]:
-    """Run one seed of one method; `train` is what ``transfer`` learns on."""
+    """Run one seed of one method; `train` is the training set of ``transfer``."""
     rng, inputs = np.random.default_rng(seed), method.prepare(table)
     ask = _asked_plainly(inputs)
     if method.reference is not None:
-        # A generator of its own: the folds of a seed are the same under every reference.
+        # A separate generator: the folds of a seed are the same with every reference.
         ask = _of_ensemble(asked_under(method.reference, table, np.random.default_rng([seed, 1])))
     if train is None:
         return cross_validate(inputs, protocol, method, rng, alpha=alpha, ask=ask)
@@ -207,28 +207,27 @@ def cross_validate(
     alpha: float,
     ask: Ask | None = None,
 ) -> dict[float, Predictions]:
-    """Predict every window once, by classifier, threshold and map that never saw its fold.
+    """Predict every window once, with classifier, threshold and map trained without its fold.
 
     Parameters
     ----------
     table : FeatureTable
         Windows, prepared for the method.
     protocol : {"cv", "lojo"}
-        Folds of the table, and of each training set, from which threshold and map are learned.
+        Folds of the table, and of each training set, on which threshold and map are set.
     method : WindowMethod
-        Makes the classifiers.
+        Creates the classifiers.
     rng : numpy.random.Generator
-        Draws folds and whatever the classifier draws.
+        For the folds and the classifiers.
     alpha : float
         Budget of the threshold.
     ask : callable, optional
-        Asks the classifier about held-out rows, where they are asked otherwise than the table holds them:
-        with another reference.
+        Query for held-out rows, if they use another reference than the table.
 
     Returns
     -------
     dict of float to Predictions
-        For each beta: 1, the published statistic, and 0, with the visible explanation removed.
+        For each beta: 1, the published statistic, and 0, without the visible explanation.
 
     Examples
     --------
@@ -264,10 +263,12 @@ def transfer(
     alpha: float,
     ask: Ask,
 ) -> dict[float, Predictions]:
-    """Predict every window of one table by what was learned on another."""
+    """Predict every window of one table after training on another."""
     shared = np.intersect1d(train.recording_keys, test.recording_keys)
     if shared.size:
-        raise InvalidArgumentError(f"transfer: expected other recordings to test on, {shared.size} shared")
+        raise InvalidArgumentError(
+            f"transfer: expected different recordings for the test, {shared.size} shared"
+        )
     calibrations = method.calibrations(train, "transfer", rng, alpha)
     probabilities = ask(method.trained(train, rng), np.ones(len(test), dtype=np.bool_))
     predictions = {}
@@ -280,13 +281,14 @@ def transfer(
 
 
 def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> FloatArray:
-    r"""Return the risks, those of each junction shifted in log-odds, shape (n,).
+    r"""Return the risks, shifted in log-odds for each junction, shape (n,).
 
     .. math:: r' = \sigma(\mathrm{logit}\, r + b), \qquad
               \tfrac{1}{n} \sum_i \sigma(\mathrm{logit}\, r_i + b) = \bar r,
 
-    with the mean over the junction's other recordings. No label is looked at, but the share of hazards among
-    the windows is taken to be what it was in training: true of a curated set, false of a street by the hour.
+    with the mean over the junction's other recordings. No labels are used, but the share of hazards among the
+    windows is assumed to be that of the training: this holds for a curated set, but not for continuous sound
+    of a street.
 
     Shapes: risk (n,).
     """
@@ -316,9 +318,9 @@ def _shift(log_odds: FloatArray, mean: float) -> float:
 def predict_held_out(
     model: Model, table: FeatureTable, alpha: float, reference: Reference, rng: np.random.Generator
 ) -> dict[float, Predictions]:
-    """Predict windows of recordings that a model never saw, for each beta as `cross_validate` does."""
+    """Predict windows of recordings outside a model's training set, for each beta as in `cross_validate`."""
     if model.domain is not None:
-        # A table that does not say, as the released one, is OVAD's.
+        # A table without a domain, such as the released one, is OVAD's.
         check_tables(model.domain, table.domain or ovad_domain(table.environments.tolist()))
     check_unseen(model, table)
     if isinstance(model.signature, EnsembleModel):
@@ -335,7 +337,7 @@ def predict_held_out(
 
 
 def check_unseen(model: Model, table: FeatureTable) -> None:
-    """Refuse a table that shares recordings with the training set of a model."""
+    """Raise an error if a table shares recordings with the training set of a model."""
     recordings = set(np.unique(table.recording_keys).tolist())
     seen = recordings & set(model.provenance.training_recordings)
     if seen:

@@ -25,7 +25,7 @@ REFERENCES: tuple[Reference, ...] = ("run", "cold", "curated")
 
 
 class LoudestDirection:
-    """Hazard odds equal to the highest level of the spatial spectrum; learns nothing.
+    """Hazard odds equal to the highest level of the spatial spectrum; not trained.
 
     Examples
     --------
@@ -49,7 +49,7 @@ class LoudestDirection:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of the comparison: a method and the statistic that is read from it."""
+    """One row of the comparison: a method and a statistic of it."""
 
     method: str  # Name in `methods`
     miss_rate: float  # beta of the statistic
@@ -64,19 +64,19 @@ def _site_ensemble(rng: np.random.Generator, simulated: SimulatedWindows | None)
 
 
 def _distant_site(rng: np.random.Generator) -> Classifier:
-    # The quiet reference alone, hardly held back. Level, which the ridge favours, is what a moving ego's own
-    # noise covers; the pattern above the quietest windows is left. Chosen among some thirty for each moving
-    # junction on the other two: thrice the same.
+    # Only the quiet reference, with weak regularisation. The ridge favours the level, which is masked by the
+    # noise of a moving ego; the pattern relative to the quietest windows remains. Chosen among about thirty
+    # recipes for each moving junction on the other two, with the same result three times.
     return SiteEnsembleClassifier((Recipe("quiet", 1e-5),))
 
 
 def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod]:
-    """Return the methods by name, the ensembles of them trained on simulated windows too."""
-    # Trained as `model fit` does.
+    """Return the methods by name; with simulated windows, the ensembles are trained on them too."""
+    # Trained as in `model fit`.
     ensemble = WindowMethod(
         partial(_site_ensemble, simulated=simulated), fit=partial(trained_ensemble, simulated=simulated)
     )
-    # The pattern alone, for a moving ego: streets of a standing one cost it (lab/NOTES.md).
+    # The pattern only, for a moving ego: streets with a standing ego reduce its accuracy (lab/NOTES.md).
     distant = WindowMethod(_distant_site, afar=True)
     return {
         "baseline": WindowMethod(PublishedClassifier),
@@ -86,33 +86,33 @@ def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod
     }
 
 
-# What is read from each method, by the name of its row.
+# Statistics of each method, by name of the row.
 ROWS = {
     "baseline": Row("baseline", PUBLISHED_MISS_RATE),
     "baseline_absent": Row("baseline", ABSENT_MISS_RATE),
     **{name: Row(name, ABSENT_MISS_RATE) for name in methods() if name != "baseline"},
 }
 
-# What `worldstate` is: the ensemble where the ego drives as it did in training, one expert where it does not.
-# The ego's motion is known, and nothing else decides.
+# The method of `worldstate`: the ensemble if the ego moves as in training, a single expert otherwise. The
+# choice depends only on the known motion of the ego.
 OURS: dict[Protocol, str] = {"cv": "ensemble", "lojo": "ensemble", "transfer": "distant_site"}
 
 
 def row_of(method: str, protocol: Protocol, reference: Reference) -> str:
-    """Return the name in `ROWS` of what a method is under a protocol and a reference."""
+    """Return the name in `ROWS` of a method under a protocol and a reference."""
     return f"{OURS[protocol]}_{reference}" if method == "worldstate" else method
 
 
 def rows_beside(row: str, protocol: Protocol, reference: Reference) -> tuple[str, ...]:
-    """Return the rows beside one: those to beat, and itself under the other references."""
+    """Return the rows to compare with one: baselines, and the same method with the other references."""
     if row == "baseline":
         return ()
     others = tuple(row_of("worldstate", protocol, other) for other in REFERENCES if other != reference)
-    # Where the ego drives and did not in training, the ensemble is one of those to beat.
+    # If the motion of the ego differs from training, the ensemble is a baseline too.
     afar = (f"ensemble_{reference}",) if protocol == "transfer" else ()
     return ("baseline", "baseline_absent", "loudest_direction", *others, *afar)
 
 
 def method_of(method: str) -> WindowMethod:
-    """Return what a method is in training: compared with curated windows."""
+    """Return a method as used in training: with curated references."""
     return methods()[row_of(method, "cv", "curated")]

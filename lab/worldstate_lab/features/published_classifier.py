@@ -1,7 +1,8 @@
-"""Training of the published classifier: standardise, mirror, linear machine, sigmoid per pair.
+"""Training of the published classifier: standardise, mirror, linear machine, one sigmoid per pair.
 
-scikit-learn's own ``SVC(probability=True)`` is deprecated, and it couples probabilities inside libsvm, where
-they cannot be taken out as plain numbers. The recipe is repeated here on top of the machine itself.
+scikit-learn's own ``SVC(probability=True)`` is deprecated, and it couples probabilities inside libsvm, from
+which they cannot be exported as numbers. The method is therefore implemented here on top of the linear
+machine.
 """
 
 from typing import Protocol, Self
@@ -23,10 +24,10 @@ PLATT_FOLDS = 5
 
 
 class Classifier(Protocol):
-    """What a signature classifier has to offer: scikit-learn's fit and predict_proba."""
+    """Interface of a signature classifier: scikit-learn's fit and predict_proba."""
 
     def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
-        """Learn from features, class names and, where it takes notice of them, names of sites.
+        """Train on features, class names and, if they are used, names of sites.
 
         Shapes: X (n, features), y, groups (n,).
         """
@@ -41,17 +42,17 @@ class Classifier(Protocol):
 
 
 class PublishedClassifier:
-    """The published pipeline, scikit-learn style.
+    """The published pipeline with scikit-learn's interface.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Draws the folds from which the sigmoids are fitted.
+        Draws the folds on which the sigmoids are fitted.
 
     Attributes
     ----------
     model_ : SignatureModel
-        After `fit`: all that inference needs.
+        After `fit`: all parameters for inference.
 
     Examples
     --------
@@ -73,21 +74,21 @@ class PublishedClassifier:
         .. math:: \min_{w, b} \tfrac12 \|w\|^2 + \sum_n \max\big(0,\; 1 - y_n (w^T z_n + b)\big), \qquad
                   z = (x - \mu) / \sigma
 
-        for each pair of classes, then a sigmoid a pair by `fit_sigmoid` on samples held out.
+        for each pair of classes, then one sigmoid per pair by `fit_sigmoid` on held-out samples.
 
         Parameters
         ----------
         X : array_like, shape (n, features)
-            One row a window.
+            One row per window.
         y : array_like of str, shape (n,)
             Class names.
         groups : array_like of str, shape (n,), optional
-            Names of sites; takes no notice of them.
+            Names of sites; ignored.
 
         Returns
         -------
         PublishedClassifier
-            Itself.
+            This object.
 
         Raises
         ------
@@ -104,7 +105,7 @@ class PublishedClassifier:
         mean, scale = standardisation(features)
         standard = (features - mean) / scale
         codes = np.searchsorted(CLASSES, labels)
-        # Thirty machines of a few dozen windows: checking what is checked above takes as long as they do.
+        # Thirty machines on a few dozen windows each: repeated input checks would double the time.
         with config_context(assume_finite=True, skip_parameter_validation=True):
             machine = SVC(kernel="linear", decision_function_shape="ovo").fit(standard, codes)
             slopes, offsets = self._fit_sigmoids(standard, codes)
@@ -125,7 +126,7 @@ class PublishedClassifier:
         Parameters
         ----------
         X : array_like, shape (n, features)
-            One row a window.
+            One row per window.
         """
         return self.model_.predict_proba(X)
 
@@ -139,7 +140,7 @@ class PublishedClassifier:
         return slopes, offsets
 
     def _held_out_decisions(self, standard: FloatArray, is_first: BoolArray) -> FloatArray:
-        """Decision values of machines that did not see the sample, positive for the first class."""
+        """Return decision values of machines trained without the sample, positive for the first class."""
         decisions = np.empty(len(standard))
         fold = self.rng.permutation(len(standard)) % PLATT_FOLDS
         for held_out in range(PLATT_FOLDS):
@@ -148,20 +149,20 @@ class PublishedClassifier:
                 decisions[test] = 1.0 if is_first[train].all() else -1.0
                 continue
             machine = SVC(kernel="linear").fit(standard[train], is_first[train])
-            # The plane itself: scikit-learn checks its input again for as long as it has fitted.
+            # Computed directly: scikit-learn's input check takes as long as the fit.
             decisions[test] = standard[test] @ machine.coef_[0] + machine.intercept_[0]
         return decisions
 
 
 def mirror_hazards(X: FloatArray, y: TextArray) -> tuple[FloatArray, TextArray]:
-    r"""Append the mirror images of all left and right windows, sides swapped.
+    r"""Append the mirror images of all left and right windows, with swapped sides.
 
     .. math:: (x, left) \to (\bar x, right), \qquad (x, right) \to (\bar x, left), \qquad
               \bar x_{s,a} = x_{s, A - 1 - a}
 
     Shapes: X (n, 2 * azimuths), y (n,).
     """
-    # Only these two classes are mirrored, as published: hazards become more frequent than they were.
+    # Only these two classes are mirrored, as published, so the share of hazards increases.
     hazard = np.isin(y, (CLASSES[LEFT], CLASSES[RIGHT]))
     swapped = np.where(y[hazard] == CLASSES[LEFT], CLASSES[RIGHT], CLASSES[LEFT])
     return np.concatenate([X, mirror_features(X[hazard])]), np.concatenate([y, swapped])

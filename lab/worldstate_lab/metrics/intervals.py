@@ -144,7 +144,7 @@ def random_detection(
     share, weight = np.broadcast_arrays(windows / total_s, np.asarray(times, np.float64))
     if ((share < 0.0) | (share > 1.0))[weight > 0.0].any():
         got = f"{windows.min():g} to {windows.max():g} s"
-        raise InvalidArgumentError(f"windows_s: expected each within the time scored, got {got}")
+        raise InvalidArgumentError(f"windows_s: expected each within the scored time, got {got}")
     detected = 1.0 - (1.0 - np.clip(share, 0.0, 1.0)) ** number
     return ratio((weight * detected).sum(axis=-1), weight.sum(axis=-1))
 

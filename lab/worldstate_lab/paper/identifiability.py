@@ -1,4 +1,4 @@
-"""What could any detector reach here? Asked of an array, and of a data set."""
+"""Limits of any detector, computed for an array and for a data set."""
 
 import math
 from dataclasses import dataclass, replace
@@ -18,25 +18,25 @@ from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate_lab.features.methods import method_of
 from worldstate_lab.metrics.intervals import pooled_draws
 
-# Estimators count in nats, the paper and the report in bits.
+# Estimators use nats, the paper and the report bits.
 _BITS = 1.0 / math.log(2.0)
 _NEIGHBOURS = 3
-# One posterior of exactly zero at the true state would make the mean of all windows infinite.
+# A single posterior of exactly zero at the true state would make the mean over all windows infinite.
 _SMALLEST = 1e-12
 
 
 class Information(NamedTuple):
     """Estimates of I(z; x) from the posteriors of a classifier, bits.
 
-    `lower` holds for any classifier on windows that it was not trained on, in expectation; `plug_in` for a
-    calibrated one, and is too high for one that is too sure of itself.
+    In expectation, `lower` is a lower bound for any classifier on windows outside its training set. `plug_in`
+    is valid for a calibrated classifier and too high for an overconfident one.
 
     Parameters
     ----------
     lower : float
         Variational lower bound.
     plug_in : float
-        Entropy of the labels less the mean entropy of the posteriors.
+        Entropy of the labels minus the mean entropy of the posteriors.
 
     Examples
     --------
@@ -64,15 +64,15 @@ def entropy_bits(probabilities: ArrayLike) -> float:
 
 
 def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Information:
-    r"""Estimate I(z; x) from posteriors q(z | x) of windows that the classifier was not trained on.
+    r"""Estimate I(z; x) from posteriors q(z | x) of windows outside the classifier's training set.
 
     .. math::
         I(z; x) \ge H(z) + \overline{\log_2 q(z_i | x_i)}, \qquad
         \hat I_{plug} = H(z) - \overline{H(q(\cdot | x_i))}.
 
-    The first is the variational lower bound of Barber and Agakov, tight where q is the true posterior; the
-    second is tight there too, but nothing bounds it elsewhere. H(z) is that of the labels given; its plug-in
-    bias of :math:`(K - 1) / 2n` nats is added back (Miller and Madow).
+    The first is the variational lower bound of Barber and Agakov, which is tight if q is the true posterior.
+    The second is also exact in that case, but otherwise not a bound. H(z) is the entropy of the given labels,
+    corrected for its plug-in bias of :math:`(K - 1) / 2n` nats (Miller and Madow).
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
     Raises
     ------
     InvalidArgumentError
-        If shapes differ, a row is no distribution or a state is none.
+        If shapes differ, a row is not a distribution or a state is invalid.
 
     References
     ----------
@@ -109,11 +109,11 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
 
 
 def state_entropy_bits(states: ArrayLike, count: int) -> float:
-    r"""Return the entropy of labels, its small-sample bias added back, at most log2 of their number.
+    r"""Return the entropy of labels, corrected for small samples, at most log2 of their number.
 
     .. math:: \hat H = \min\Big(-\sum_k \hat p_k \log_2 \hat p_k + \frac{K_+ - 1}{2 n \ln 2},\; \log_2 K\Big)
 
-    with K_+ the labels that occur.
+    where K_+ is the number of labels that occur.
 
     Shapes: states (n,).
 
@@ -133,13 +133,14 @@ def state_entropy_bits(states: ArrayLike, count: int) -> float:
 
 
 def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike) -> float:
-    r"""Estimate I(z; x) from distances alone, without a classifier.
+    r"""Estimate I(z; x) from distances only, without a classifier.
 
     .. math:: \hat I = \psi(n) + \psi(k) - \overline{\psi(n_{z_i})} - \overline{\psi(m_i)},
 
     with n_z windows of the state of i and m_i windows of any state within the distance of the k-th neighbour
-    of its own state. Consistent, with a bias downward that grows with the dimension: reduce features to a few
-    components first. Distances are the largest difference of any component, so bring those to one scale.
+    of its own state. The estimate is consistent, with a negative bias that grows with the dimension: reduce
+    features to a few components first. Distances are the largest difference of any component, so scale the
+    components equally.
 
     Parameters
     ----------
@@ -151,7 +152,7 @@ def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike) -
     Returns
     -------
     float
-        Bits; may be below zero by chance.
+        Bits; may be negative by chance.
 
     Raises
     ------
@@ -180,7 +181,7 @@ def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike) -
     kept = np.isin(z, names[counts > k])
     x, z = x[kept], z[kept]
     if not z.size:
-        raise InvalidArgumentError(f"states: expected more than {k} windows of some state")
+        raise InvalidArgumentError(f"states: expected a state with more than {k} windows")
     radius, own = np.empty(z.size), np.empty(z.size)
     for name in np.unique(z):
         rows = np.flatnonzero(z == name)
@@ -196,8 +197,8 @@ def fano_bound(entropy: float, information: float, states: int) -> float:
 
     .. math:: P_e \ge \frac{H(z) - I(z; x) - 1}{\log_2 K}
 
-    It is a statement on all detectors only with an I that is not below the true one: from the lower bound of
-    `information_from_posteriors` it becomes an estimate. With H of two bits and less it is often void; see
+    It bounds all detectors only if I is not below the true value: with the lower bound of
+    `information_from_posteriors` it becomes an estimate. If H is two bits or less, it is often void; see
     `sharp_fano_bound`.
 
     Parameters
@@ -231,14 +232,14 @@ def fano_bound(entropy: float, information: float, states: int) -> float:
 
 
 def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
-    r"""Return the smallest error probability that Fano's inequality allows, without loosening it.
+    r"""Return the smallest error probability that Fano's inequality permits, in its exact form.
 
     .. math:: h(P_e) + P_e \log_2 (K - 1) \ge H(z) - I(z; x),
 
-    with the binary entropy h, solved for the smallest P_e. Never below `fano_bound`, and attained by the
-    symmetric channel.
+    with the binary entropy h, solved for the smallest P_e. It is never below `fano_bound`, and the symmetric
+    channel attains it.
 
-    Errors are those of `fano_bound`.
+    Errors are raised as in `fano_bound`.
 
     Parameters
     ----------
@@ -287,23 +288,23 @@ def _checked(posteriors: ArrayLike, states: ArrayLike) -> tuple[FloatArray, Inde
     z = np.asarray(states)
     check_shape("states", z.shape, (len(q),))
     if not z.size or (q < 0.0).any() or not np.allclose(q.sum(axis=1), 1.0, atol=1e-6):
-        raise InvalidArgumentError("posteriors: expected at least one row, each of them a distribution")
+        raise InvalidArgumentError("posteriors: expected at least one row, and each row a distribution")
     if z.dtype.kind not in "iu" or z.min() < 0 or z.max() >= q.shape[1]:
         raise InvalidArgumentError(f"states: expected integers from 0 to {q.shape[1] - 1}")
     return q, z.astype(np.intp)
 
 
-# A kNN estimate in more dimensions than this is far below the truth at a few hundred windows.
+# In more dimensions, a kNN estimate from a few hundred windows is far below the true value.
 _COMPONENTS = 3
-# A standard deviation over so many draws is known to 5 %.
+# The standard deviation over this many draws has a relative error of 5 %.
 _BOOTSTRAPS = 200
 
 
 @dataclass(frozen=True, slots=True)
 class ReachOnData:
-    """Bounds on how well the state of a data set's windows can be told from their features."""
+    """Bounds on the accuracy with which a data set's features determine its states, for any classifier."""
 
-    states: int  # K and n
+    states: int  # K, and below n
     windows: int
     entropy_bits: float  # H(z)
     # Estimates of I(z; x), bits: variational lower bound and plug-in from the posteriors, and kNN on the
@@ -311,11 +312,11 @@ class ReachOnData:
     information_lower: float
     information_plug_in: float
     information_neighbours: float
-    # The largest estimate plus two bootstrap standard deviations: what the bound is stated at.
+    # The largest estimate plus two bootstrap standard deviations, at which the bound is evaluated.
     information_high: float
-    error: float  # Of the classifier itself
-    # No detector errs less than this, if the information is not above `information_high`: the paper's form
-    # and the one without its slack.
+    error: float  # Error of the classifier itself
+    # Lower bounds on the error of any detector, if the information is not above `information_high`: the
+    # paper's form and the exact form.
     fano: float
     sharp_fano: float
 
@@ -330,14 +331,14 @@ def reach_on_data(
 ) -> ReachOnData:
     """Bound the error of any detector on windows like these.
 
-    Fano's inequality needs I(z; x) from above, and data give it from below or with a bias: the bound is
-    stated at the largest of three estimates plus two standard deviations over a bootstrap of recordings. It
-    is an estimate of a bound, no proof.
+    Fano's inequality needs an upper bound of I(z; x), but data give a lower bound or a biased estimate: the
+    bound is evaluated at the largest of three estimates plus two standard deviations over a bootstrap of
+    recordings. It is an estimate of a bound and not a proof.
 
     Parameters
     ----------
     posteriors : array_like, shape (n, K)
-        Of windows that the classifier was not trained on.
+        Of windows outside the classifier's training set.
     states : array_like of int, shape (n,)
         True states, 0 to K - 1.
     rng : numpy.random.Generator
@@ -345,7 +346,7 @@ def reach_on_data(
     features : array_like, shape (n, d), optional
         For the kNN estimate.
     groups : array_like, shape (n,), optional
-        Recording of each window; windows stand alone where not given.
+        Recording of each window; by default each window is its own.
 
     Returns
     -------
@@ -355,7 +356,7 @@ def reach_on_data(
     Raises
     ------
     InvalidArgumentError
-        If shapes do not fit or there are fewer than two states.
+        If shapes do not match or there are fewer than two states.
 
     Examples
     --------
@@ -389,8 +390,8 @@ def reach_on_data(
 
 
 def reach_on_table(table: FeatureTable, method: str, rng: np.random.Generator) -> ReachOnData:
-    """Bound the error of any classifier of the windows of a table, beside that of a method out of fold."""
-    # Asked as prepared: about windows compared with curated ones.
+    """Bound the error of any classifier of a table's windows, with the out-of-fold error of a method."""
+    # With curated references, as prepared.
     chosen = method_of(method)
     posteriors = replace(chosen, reference=None).posteriors(chosen.prepare(table), rng)
     states = np.array([CLASSES.index(label) for label in table.labels.tolist()])
@@ -400,14 +401,14 @@ def reach_on_table(table: FeatureTable, method: str, rng: np.random.Generator) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReachOfArray:
-    """How well a bearing could be told with an array, by the Cramer-Rao bound."""
+    """Smallest bearing error that an array permits, by the Cramer-Rao bound."""
 
-    azimuths_rad: FloatArray  # shape (n,): Directions asked for
+    azimuths_rad: FloatArray  # shape (n,): Requested directions
     # shape (n,): Smallest standard deviation of any unbiased estimator; inf at endfire of a line array.
     std_rad: FloatArray
-    # shape (n,): The same once a camera of `vision_std_rad` sees the source too, under (A1).
+    # shape (n,): The same if a camera of `vision_std_rad` also sees the source, under (A1).
     with_vision_rad: FloatArray
-    # shape (n,): Bearing information relative to the best direction, the corollary's cos^2.
+    # shape (n,): Bearing information relative to the best direction, cos^2 in the corollary.
     endfire: FloatArray
 
 
@@ -425,7 +426,7 @@ def reach_of_array(
     .. math:: \sigma(\theta) \ge (J_{ac} + J_{vis})^{-1/2}, \qquad J_{ac} \propto \cos^2\theta\, S_{xx}
 
     for an array across the vehicle. Presence, approach speed and coarse side do not depend on the bearing and
-    remain where this one is lost.
+    remain observable where it is not.
 
     Parameters
     ----------
@@ -448,7 +449,7 @@ def reach_of_array(
     Raises
     ------
     InvalidArgumentError
-        As `frontend.bounds.cramer_rao.bearing_crb_rad2`.
+        See `frontend.bounds.cramer_rao.bearing_crb_rad2`.
 
     Examples
     --------
@@ -471,7 +472,8 @@ def reach_of_array(
         together = 1.0 / np.sqrt(heard + seen)
     return ReachOfArray(
         azimuths_rad=azimuths,
-        # Round-off leaves a sliver of information at endfire: a spread beyond half a turn is no bearing.
+        # Round-off leaves a little information at endfire: a standard deviation above half a turn means no
+        # bearing.
         std_rad=np.where(std > math.pi, math.inf, std),
         with_vision_rad=together,
         endfire=endfire_information(array.positions_m, azimuths),
@@ -495,7 +497,7 @@ def _neighbours(features: ArrayLike, states: NDArray[np.int_]) -> float:
 
 
 def _spread(q: FloatArray, states: NDArray[np.int_], units: IndexArray, rng: np.random.Generator) -> float:
-    """Return the bootstrap standard deviation of the lower bound, whole recordings drawn."""
+    """Return the bootstrap standard deviation of the lower bound, with draws of whole recordings."""
     order = np.argsort(units, kind="stable")
     rows = np.split(order, np.cumsum(np.bincount(units))[:-1])
     chosen = pooled_draws(rows, [0] * len(rows), rng, _BOOTSTRAPS)

@@ -1,1 +1,1 @@
-"""A planner that reads the chances of the state at a blind corner, beside one that assumes the worst."""
+"""A planner that uses the chances of the state at a blind corner, compared with a worst-case planner."""

@@ -1,4 +1,4 @@
-"""Corners that a planner comes to: the ego and its stopping law, states and vehicles of recorded streams."""
+"""Encounters at a corner: the ego and its stopping law, states and vehicles of recorded streams."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -28,47 +28,47 @@ _SPEED_ROWS = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossing:
-    """How a vehicle out of a hidden arm crosses the ego's axis, tenth of a second by tenth."""
+    """Motion of a vehicle from a hidden arm across the ego's axis, in steps of 0.1 s."""
 
     side: int
     entry_s: float
     length_m: float
     width_m: float
     time_s: FloatArray  # shape (r,)
-    to_come_m: FloatArray  # shape (r,): Of its front to the axis, negative behind it
-    in_view: BoolArray  # shape (r,): From where the state was recorded
+    to_come_m: FloatArray  # shape (r,): Distance of its front to the axis, negative after crossing
+    in_view: BoolArray  # shape (r,): From the position at which the state was recorded
 
     def at(self, clock_s: FloatArray) -> FloatArray:
-        """Return the way to come at some times; before its first row it came as fast as it is there."""
+        """Return the distance to the axis at given times; before the first row its first speed is assumed."""
         last = min(_SPEED_ROWS, len(self.time_s) - 1)
         speed = (self.to_come_m[0] - self.to_come_m[last]) / max(self.time_s[last] - self.time_s[0], 0.1)
         early = np.maximum(self.time_s[0] - clock_s, 0.0)
         return np.asarray(np.interp(clock_s, self.time_s, self.to_come_m, right=GONE_M) + speed * early)
 
     def seen(self, clock_s: FloatArray) -> BoolArray:
-        """Tell when it is in view."""
+        """Return whether it is in view at given times."""
         row = np.searchsorted(self.time_s, clock_s + 1e-6, side="right") - 1
         return np.asarray(self.in_view[np.maximum(row, 0)] & (row >= 0) & (clock_s <= self.time_s[-1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BelievedStream:
-    """The chances that a stream's snapshots state, and the vehicles there; sides are left and right."""
+    """The chances in a stream's snapshots, and its vehicles; the two sides are left and right."""
 
     time_s: FloatArray  # shape (n,)
     within: FloatArray  # shape (n, 2, horizons): Probability to come into view within each horizon
     heard: HeardStream
     site: Site
-    ways: tuple[Crossing, ...]  # Of vehicles out of a hidden arm
+    ways: tuple[Crossing, ...]  # Vehicles from a hidden arm
     others: IndexArray  # Numbers of all other vehicles
 
 
 def believed_stream(path: Path, model: Model, cache: Path | None) -> BelievedStream:
-    """Return a stream with its chances, kept in a folder by the content of stream and model."""
+    """Return a stream with its chances, cached in a folder by the content of stream and model."""
     follow = partial(_chances, path, model)
     if cache is None:
         return with_chances(HeardStream.load(path), follow()[_CHANCES])
-    # The filter's own code is no part of the name: after a change of it another folder is due.
+    # The key does not include the filter's code: after a change of the code, use another folder.
     marks = [content_hash(path), encode(model)]
     return with_chances(HeardStream.load(path), PassCache(cache).tables(_CHANCES, marks, follow)[_CHANCES])
 
@@ -79,7 +79,7 @@ def _chances(path: Path, model: Model) -> dict[str, HopTable]:
 
 
 def with_chances(heard: HeardStream, chances: HopTable) -> BelievedStream:
-    """Return a stream with what was said of it; where nothing was said the chance is one."""
+    """Return a stream with published chances; a missing chance is set to one."""
     return BelievedStream(
         time_s=chances.time_s,
         within=np.nan_to_num(chances.within, nan=1.0),
@@ -100,7 +100,7 @@ def _way(heard: HeardStream, i: int) -> Crossing:
         length_m=kind.length_m,
         width_m=kind.width_m,
         time_s=rows.time_s[mine],
-        # Rows hold the front axle, and left is positive.
+        # Rows contain the front axle, and left is positive.
         to_come_m=(1.0 - 2.0 * side) * rows.y_m[mine] - kind.axles_m[0],
         in_view=rows.in_view[mine].astype(np.bool_),
     )
@@ -108,25 +108,25 @@ def _way(heard: HeardStream, i: int) -> Crossing:
 
 @dataclass(frozen=True, slots=True)
 class EgoVehicle:
-    """A car with its limits; seen and heard are all things `reaction_s` late."""
+    """A car with its limits; it reacts to everything after `reaction_s`."""
 
     length_m: float = 4.3
     width_m: float = 1.8
-    # Cameras in the bumper's corners, as parking aids have them: from behind a windscreen, two metres back,
-    # no camera sees into these streets before the bumper is in them.
+    # Cameras in the corners of the bumper, as for parking aids: from behind a windscreen, two metres back, no
+    # camera sees into these streets before the bumper has entered them.
     eye_m: float = 0.5  # Behind the bumper
-    limit_mps: float = 25.0 / 3.6  # Of both streets; the fastest vehicle of the streams drives 22 km/h
+    limit_mps: float = 25.0 / 3.6  # On both streets; the fastest vehicle of the streams drives at 22 km/h
     acceleration_mps2: float = 2.0
-    comfortable_mps2: float = 2.0  # Braking for what may come
-    full_mps2: float = 6.0  # Braking for what is there
+    comfortable_mps2: float = 2.0  # Braking for a possible vehicle
+    full_mps2: float = 6.0  # Braking for a vehicle in view
     reaction_s: float = 0.3
-    begins_m: float = 30.0  # Before the line at which it would stand
+    begins_m: float = 30.0  # Start before the line at which it would stop
     begins_mps: float = 25.0 / 3.6
-    gap_m: float = 0.25  # Between the bumper that stands and a vehicle that passes
-    gap_s: float = 0.3  # Between vehicles that leave and enter the conflict zone
+    gap_m: float = 0.25  # Between the stopped bumper and a passing vehicle
+    gap_s: float = 0.3  # Between one vehicle leaving and another entering the conflict zone
 
     def stopping_speed_mps(self, room_m: FloatArray, reaction_s: float) -> FloatArray:
-        r"""Return the highest speed from which it stands within d metres, having reacted after tau.
+        r"""Return the highest speed from which it stops within d metres after the reaction time tau.
 
         .. math:: v(d) = -b \tau + \sqrt{b^2 \tau^2 + 2 b d}
 
@@ -139,7 +139,7 @@ class EgoVehicle:
         return -lost + np.sqrt(lost**2 + 2.0 * self.comfortable_mps2 * np.maximum(room_m, 0.0))
 
     def soonest_s(self, way_m: FloatArray, speed_mps: FloatArray) -> FloatArray:
-        """Return how long it takes for some way if it accelerates to the limit.
+        """Return the time to drive a distance with acceleration up to the limit.
 
         Examples
         --------
@@ -152,32 +152,35 @@ class EgoVehicle:
         return np.asarray(rising + np.maximum(way - until_m, 0.0) / self.limit_mps)
 
 
-# Where the states were recorded: the bumper two metres ahead of an array that stands about so far away.
+# Position at which the states were recorded: the bumper is two metres ahead of an array at about this
+# distance.
 FROM_STANDING = EgoVehicle(begins_m=3.5, begins_mps=0.0)
 
 
 STEP_S, HOP_STEPS = 0.05, 2
 LASTS_S = 25.0
 STEPS = round(LASTS_S / STEP_S)
-MEETS_WITHIN_S = 3.0  # Between vehicle and an ego that never brakes, in the middle of the conflict zone
+MEETS_WITHIN_S = 3.0  # Between a vehicle and an ego that never brakes, in the middle of the conflict zone
 MOST_VEHICLES = 6
 _NEAR_M, _BEFORE_S, _AFTER_S, _PASSED_S = 12.0, 1.0, 15.0, 8.0
-# Half the widest lorry: what a planner leaves free where it sees no vehicle.
+# Half the width of the widest lorry: the margin of a planner if it sees no vehicle.
 HALF_LANE_M = 1.25
 _ROUNDS, _MINUTES = 200, 10_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Encounters:
-    """Replays, one a row; K vehicles, missing ones gone from the beginning; lanes left, right."""
+    """Replays, one per row; K vehicles, missing ones already past; lanes left, right."""
 
     recorded: IndexArray  # shape (n,): Number of the approach, or of a minute without vehicles
     corner_ahead_m: FloatArray  # shape (n,)
     corner_m: FloatArray  # shape (n, 2): Distance of the corners from the ego's axis
-    lane_m: FloatArray  # shape (n, 2): How far ahead vehicles from the left and from the right drive
+    # shape (n, 2): Distance ahead of the lanes of vehicles from the left and from the right
+    lane_m: FloatArray
     within: FloatArray  # shape (n, STEPS / HOP_STEPS, 2, horizons)
-    to_come_m: FloatArray  # shape (n, STEPS, K): Way of the front to the ego's axis, negative behind it
-    in_view: BoolArray  # shape (n, STEPS, K): From where the state was recorded
+    # shape (n, STEPS, K): Distance of the front to the ego's axis, negative after crossing
+    to_come_m: FloatArray
+    in_view: BoolArray  # shape (n, STEPS, K): From the position at which the state was recorded
     side: IndexArray  # shape (n, K)
     length_m: FloatArray  # shape (n, K)
     width_m: FloatArray  # shape (n, K)
@@ -187,7 +190,7 @@ class Encounters:
 
     @property
     def line_m(self) -> FloatArray:
-        """Where the lane that is nearer begins, shape (n,)."""
+        """Distance ahead of the start of the nearer lane, shape (n,)."""
         return np.asarray(self.lane_m[:, 0] - HALF_LANE_M)
 
 
@@ -200,7 +203,7 @@ def joined_encounters(parts: Sequence[Encounters]) -> Encounters:
 def recorded_approaches(
     streams: Sequence[BelievedStream], *, quiet: bool
 ) -> list[tuple[BelievedStream, StreamApproach]]:
-    """Return all approaches of loud vehicles alone, or those with a quiet one among them."""
+    """Return all approaches with loud vehicles only, or those with at least one quiet vehicle."""
     return [(stream, one) for stream in streams for one in approaches(stream.heard) if one.quiet is quiet]
 
 
@@ -210,9 +213,9 @@ def approach_encounters(
     ego: EgoVehicle,
     rng: np.random.Generator,
 ) -> Encounters:
-    """Draw replays, each recorded approach as often as the others, the ego uniformly within 3 s of it.
+    """Draw replays: each recorded approach equally often, the ego's timing uniform within 3 s of a meeting.
 
-    Drawn again are replays in which a vehicle drives in the ego's own street.
+    If a vehicle drives in the ego's own street, the replay is drawn again.
     """
     found: list[Encounters] = []
     for _ in range(_ROUNDS if recorded else 0):
@@ -227,7 +230,7 @@ def approach_encounters(
 
 
 def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.random.Generator) -> Encounters:
-    """Draw moments of streams without hazards at which no vehicle is in view or in the ego's own street."""
+    """Draw times of hazard-free streams without a vehicle in view or in the ego's own street."""
     found: list[Encounters] = []
     for _ in range(_ROUNDS * count):
         number = len(found) % max(len(streams), 1)
@@ -236,16 +239,16 @@ def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.rand
         first_s, last_s = streams[number].time_s[[0, -1]]
         start_s = rng.uniform(first_s + _BEFORE_S, last_s - LASTS_S)
         if _usable(streams[number], start_s):
-            # Moments of one minute hear the same vehicles: they count as one in intervals.
+            # Times within one minute share the same vehicles, so they count as one in intervals.
             minute = number * _MINUTES + int(start_s // 60.0)
             found.append(_encounter(streams[number], start_s, minute))
     if len(found) < count:
-        raise InvalidArgumentError(f"streams: expected {count} moments without vehicles, found {len(found)}")
+        raise InvalidArgumentError(f"streams: expected {count} times without vehicles, found {len(found)}")
     return joined_encounters(found)
 
 
 def _meets_s(stream: BelievedStream, one: StreamApproach, ego: EgoVehicle) -> float:
-    """Return when an ego that never brakes has to begin to meet the first vehicle of an approach."""
+    """Return when an ego that never brakes must start to meet the first vehicle of an approach."""
     first = min(stream.ways, key=lambda way: abs(way.entry_s - one.entries_s[0]))
     middle_s = float(np.interp(0.0, -first.to_come_m - 0.5 * first.length_m, first.time_s))
     near_m, lane_m = stream.site.lanes_m[0], stream.site.lanes_m[first.side]
@@ -257,7 +260,7 @@ def _usable(stream: BelievedStream, start_s: float) -> bool:
     if not stream.time_s[0] + _BEFORE_S <= start_s <= stream.time_s[-1] - LASTS_S:
         return False
     rows = stream.heard.rows
-    # Rows of others are few: those in the window are looked for first.
+    # Other vehicles have few rows, so the rows in the window are selected first.
     during = np.flatnonzero((rows.time_s > start_s - _BEFORE_S) & (rows.time_s < start_s + _AFTER_S))
     near = rows.in_view[during] | (np.hypot(rows.x_m[during], rows.y_m[during]) < _NEAR_M)
     return not np.isin(rows.vehicle[during[near]], stream.others).any()

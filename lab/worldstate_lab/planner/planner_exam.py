@@ -1,4 +1,4 @@
-"""Planners at the same corners, in closed loop: collisions, needless braking, time lost."""
+"""Closed-loop comparison of planners at the same corners: collisions, needless braking, lost time."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,29 +35,30 @@ _LEAST_MPS = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drives:
-    """What became of every encounter."""
+    """Result of every encounter."""
 
     collided: BoolArray  # shape (n,)
-    braking_s: FloatArray  # shape (n,): Held back from what it may do: braking, standing, or not accelerating
+    # shape (n,): Time below the permitted acceleration: braking, stopped, or not accelerating
+    braking_s: FloatArray
     hardest_mps2: FloatArray  # shape (n,)
-    took_s: FloatArray  # shape (n,): Until its rear has left the conflict zone
-    needed: BoolArray  # shape (n,): Whether one that never brakes comes within a second of a vehicle
-    front_m: FloatArray  # shape (n, STEPS): Where its bumper is
+    took_s: FloatArray  # shape (n,): Time until its rear has left the conflict zone
+    needed: BoolArray  # shape (n,): Whether an ego that never brakes comes within a second of a vehicle
+    front_m: FloatArray  # shape (n, STEPS): Position of its bumper
 
     @property
     def needless_s(self) -> FloatArray:
-        """Braking where none was due."""
+        """Braking time in encounters without a need to brake."""
         return np.where(self.needed, 0.0, self.braking_s)
 
 
 def drive_through(
     encounters: Encounters, threshold: float, ego: EgoVehicle, *, remembers: bool = False
 ) -> Drives:
-    """Drive through all encounters, braking for vehicles that it sees or assumes.
+    """Drive through all encounters, braking for visible and for assumed vehicles.
 
-    One is assumed at the limit just behind what can be seen of a side while the chance that a vehicle comes
-    into view from there within `HORIZON_S` is not below the threshold: always at 0, never at infinity. If it
-    remembers, the vehicle is assumed no nearer than where one may be that has never been in sight.
+    A vehicle at the speed limit is assumed just beyond the visible part of a side as long as the chance that
+    a vehicle comes into view from there within `HORIZON_S` is at least the threshold: always at 0, never at
+    infinity. With memory, the vehicle is assumed no nearer than a vehicle can be that was never in sight.
     """
     assumed = encounters.within[..., HORIZONS_S.index(HORIZON_S)] >= threshold
     n = len(encounters)
@@ -76,7 +77,7 @@ def drive_through(
         first_seen = np.minimum(first_seen, np.where(visible, step, STEPS * 2))
         hop = max(step - late, 0) // HOP_STEPS
         free = np.minimum(ego.acceleration_mps2, (ego.limit_mps - v) / STEP_S)
-        # A view that has just opened has told nothing yet.
+        # The view just opened is used only after the reaction time.
         then = sight_m(encounters, fronts[:, max(step - late, 0)] - ego.eye_m)
         reach = unseen_from_m(reach, then, ego.limit_mps * STEP_S) if remembers else then
         for_hidden = _for_assumed(encounters, ego, x, v, reach, assumed[:, hop])
@@ -97,20 +98,20 @@ def drive_through(
 
 
 def sight_m(encounters: Encounters, eye_m: FloatArray) -> FloatArray:
-    """Return how far into either lane an eye sees past the corner, shape (n, 2)."""
+    """Return the visible length of either lane beyond the corner, shape (n, 2)."""
     before = (encounters.corner_ahead_m - eye_m)[:, None]
     reach = (encounters.lane_m - eye_m[:, None]) / np.maximum(before, 1e-3)
     return np.where(before > 0.0, np.minimum(encounters.corner_m * reach, _FAR_M), _FAR_M)
 
 
 def unseen_from_m(before_m: FloatArray, sight_m: FloatArray, driven_m: float) -> FloatArray:
-    r"""Return how near a vehicle may be that was never in sight, one step after it was `before_m`.
+    r"""Return the smallest distance of a vehicle never in sight, one step after it was `before_m`.
 
     .. math:: R(t) = \max(S(t), R(t - \Delta t) - v \Delta t) = \max_{t' \le t} S(t') - v (t - t')
 
-    S is how far the lane is seen and v the fastest speed. R is attained by a vehicle at v that was at the
-    edge of sight at the maximising t'. While S grows R is S: what is just behind the edge came from farther
-    behind it, unseen.
+    S is the visible length of the lane and v the highest speed. R is reached by a vehicle at v that was at
+    the edge of sight at the maximising t'. While S grows, R equals S: a vehicle just beyond the edge came
+    from farther behind it, unseen.
 
     Examples
     --------
@@ -128,18 +129,18 @@ def _for_assumed(
     reach_m: FloatArray,
     assumed: BoolArray,
 ) -> FloatArray:
-    """Return the acceleration that leaves it able to stop before an assumed vehicle."""
+    """Return the acceleration with which the ego can still stop before an assumed vehicle."""
     room = encounters.line_m - ego.gap_m - x
     out_m = encounters.lane_m + HALF_LANE_M + ego.length_m - x[:, None]
     arrives_s = (reach_m - 0.5 * ego.width_m) / ego.limit_mps - ego.reaction_s
     passes = ego.soonest_s(out_m, v[:, None]) + ego.gap_s <= arrives_s
-    # Beyond the line it is too late to stop for what may come.
+    # Beyond the line it is too late to stop for an assumed vehicle.
     stops = (assumed & ~passes).any(axis=1) & (v**2 <= 2.0 * ego.full_mps2 * room)
     return np.where(stops, _towards(ego, room, v, ego.reaction_s), np.inf)
 
 
 def _towards(ego: EgoVehicle, room_m: FloatArray, v: FloatArray, reaction_s: float) -> FloatArray:
-    """Return the acceleration that keeps it able to stop in some room, harder than comfortably if it must."""
+    """Return the acceleration that permits a stop within a distance, beyond the comfort limit if needed."""
     target = ego.stopping_speed_mps(room_m - v * STEP_S, reaction_s)
     needed = v**2 / (2.0 * np.maximum(room_m, 1e-3))
     return np.maximum((target - v) / STEP_S, -np.clip(needed, ego.comfortable_mps2, ego.full_mps2))
@@ -148,15 +149,16 @@ def _towards(ego: EgoVehicle, room_m: FloatArray, v: FloatArray, reaction_s: flo
 def _for_seen(
     encounters: Encounters, ego: EgoVehicle, x: FloatArray, v: FloatArray, step: int, known: BoolArray
 ) -> FloatArray:
-    """Return the acceleration with which it lets vehicles pass that it sees and would meet."""
-    # What it knows is as old as its reaction.
+    """Return the acceleration with which the ego gives way to visible vehicles that it would meet."""
+    # Observations are as old as the reaction time.
     late = round(ego.reaction_s / STEP_S)
     steps = max(step - late, 0), max(step - late - 2, 0)
     now, before = (encounters.to_come_m[:, one] for one in steps)
     speed = np.maximum((before - now) / (2.0 * STEP_S), _LEAST_MPS)
     now = now - speed * late * STEP_S
     half, lane = 0.5 * encounters.width_m, np.take_along_axis(encounters.lane_m, encounters.side, axis=1)
-    # What has braked before the corner speeds up behind it: it is not to be passed at its present pace.
+    # A vehicle that braked before the corner accelerates after it: its present speed must not be
+    # extrapolated.
     enters_s = ego.soonest_s(now - 0.5 * ego.width_m, speed)
     leaves_s = (now + 0.5 * ego.width_m + encounters.length_m) / speed
     in_m, out_m = lane - half - x[:, None], lane + half + ego.length_m - x[:, None]
@@ -165,7 +167,7 @@ def _for_seen(
     lets_pass = known & ~first & ~after & (leaves_s > 0.0) & (out_m > 0.0)
     line = (encounters.line_m - x)[:, None]
     can = v[:, None] ** 2 <= 2.0 * ego.full_mps2 * np.maximum(line - ego.gap_m, 0.0)
-    # Past the line, or too fast for it, before this vehicle's own way at least.
+    # If the ego is past the line, or too fast to stop there, it stops at least before this vehicle's path.
     room = np.where(can & (line > 0), line, in_m) - ego.gap_m
     braked = _towards(ego, room, v[:, None], 0.0)
     inside = in_m <= 0.0
@@ -173,7 +175,7 @@ def _for_seen(
 
 
 def _overlaps(encounters: Encounters, ego: EgoVehicle, x: FloatArray, step: int) -> BoolArray:
-    """Tell whether the footprint of the ego lies on that of a vehicle."""
+    """Return whether the footprint of the ego overlaps that of a vehicle."""
     lane, half = np.take_along_axis(encounters.lane_m, encounters.side, axis=1), 0.5 * encounters.width_m
     along = (x[:, None] > lane - half) & (x[:, None] - ego.length_m < lane + half)
     front = encounters.to_come_m[:, step]
@@ -182,7 +184,7 @@ def _overlaps(encounters: Encounters, ego: EgoVehicle, x: FloatArray, step: int)
 
 
 def _needed(encounters: Encounters, ego: EgoVehicle) -> BoolArray:
-    """Tell whether an ego that never brakes comes so near in time to a vehicle that braking is due."""
+    """Return whether an ego that never brakes comes so close in time to a vehicle that braking is needed."""
     lane, half = np.take_along_axis(encounters.lane_m, encounters.side, axis=1), 0.5 * encounters.width_m
     begins, speed = (encounters.line_m - ego.begins_m)[:, None], np.array([ego.begins_mps])
     in_s = ego.soonest_s(lane - half - begins, speed) - NEEDED_WITHIN_S
@@ -204,14 +206,14 @@ UNAWARE, PHANTOM, FULL, MEMORY, CHANCE, LOUD = (
     "chance, loud",
 )
 THRESHOLDS = tuple(round(0.001 * 2.0 ** (0.5 * step), 4) for step in range(13))
-# Of corners at which a vehicle comes.
+# Shares of corners with a vehicle.
 SHARES = (0.05, 0.2)
 HARD_MPS2 = 4.0
-_QUIET = 100_000  # Numbers of quiet approaches beside those of loud ones
+_QUIET = 100_000  # Offset of the numbers of quiet approaches from those of loud ones
 
 
 class ByKind(NamedTuple, Generic[Of]):
-    """One thing each of loud approaches, of those with a quiet vehicle, and of moments without vehicles."""
+    """One item each for loud approaches, approaches with a quiet vehicle, and times without vehicles."""
 
     loud: Of
     quiet: Of
@@ -219,13 +221,13 @@ class ByKind(NamedTuple, Generic[Of]):
 
 
 Corners = ByKind[Encounters]
-CornerDrives = ByKind[Drives]  # One planner's, through such corners
+CornerDrives = ByKind[Drives]  # Of one planner
 
 
 def draw_corners(
     streams: Sequence[BelievedStream], count: int, ego: EgoVehicle, rng: np.random.Generator
 ) -> Corners:
-    """Draw approaches of loud vehicles, quiet ones by their share, and as many moments without vehicles."""
+    """Draw approaches of loud vehicles, quiet ones by their share, and as many times without vehicles."""
     loud, quiet = approaches_drawn(streams, count, ego, rng)
     return Corners(loud, quiet, empty_encounters([one for one in streams if not one.ways], count, rng))
 
@@ -233,15 +235,16 @@ def draw_corners(
 def approaches_drawn(
     streams: Sequence[BelievedStream], count: int, ego: EgoVehicle, rng: np.random.Generator
 ) -> tuple[Encounters, Encounters]:
-    """Draw so many approaches of loud vehicles, and of quiet ones as many as their share asks for."""
+    """Draw this many approaches of loud vehicles, and quiet ones in proportion to their share."""
     loud, quiet = (recorded_approaches(streams, quiet=kind) for kind in (False, True))
     quiet_count = max(round(count * len(quiet) / max(len(loud), 1)), 1)
     return approach_encounters(loud, count, ego, rng), approach_encounters(quiet, quiet_count, ego, rng)
 
 
 def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
-    """Return the threshold below the largest up to which no vehicle is hit; 0, the phantom, without one."""
-    # What hits no vehicle at some 130 approaches may hit one elsewhere: one step is kept in hand.
+    """Return the threshold below the largest one without collisions; 0, the phantom, if there is none."""
+    # A threshold without collisions in about 130 approaches may cause one elsewhere: one step is kept as a
+    # margin.
     kept = 0.0
     for lower, threshold in pairwise((0.0, *THRESHOLDS)):
         if any(drive_through(one, threshold, ego).collided.any() for one in approached):
@@ -253,7 +256,7 @@ def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
 def drives_of(
     corners: Corners, threshold: float, ego: EgoVehicle, *, remembers: bool = False
 ) -> CornerDrives:
-    """Return the drives of the planner that assumes vehicles from a chance on."""
+    """Return the drives of the planner that assumes a vehicle if its chance is above a threshold."""
     return CornerDrives(*(drive_through(one, threshold, ego, remembers=remembers) for one in corners))
 
 
@@ -272,16 +275,16 @@ def every_planner(corners: Corners, chance: float, loud: float, ego: EgoVehicle)
 def planner_figures(
     corners: Corners, planners: Mapping[str, CornerDrives], rng: np.random.Generator
 ) -> dict[str, dict[str, float | int]]:
-    """Return the figures of every planner, ready for a table and for JSON; intervals are of 95 %."""
+    """Return the figures of every planner, for a table and for JSON, with 95 % intervals."""
     approached = np.r_[corners.loud.recorded, _QUIET + corners.quiet.recorded]
-    # Replays of one vehicle, and moments of one minute, are drawn together.
+    # Replays of one vehicle, and times of one minute, are drawn together.
     drawn = _with_mean(approached, rng), _with_mean(corners.empty.recorded, rng)
     phantom = _needless_s(planners[PHANTOM], *drawn)
     return {name: _figures(corners, one, _needless_s(one, *drawn), phantom) for name, one in planners.items()}
 
 
 def _with_mean(recorded: IndexArray, rng: np.random.Generator) -> FloatArray:
-    """Return the weights of replays in the mean, then in draws of what was recorded, each summing to one."""
+    """Return weights of replays, equal ones first, then for draws of the recorded items; each sums to one."""
     which, members = np.unique(recorded, return_inverse=True)
     drawn = draw_weights(stratified_draws([0] * which.size, rng), which.size)[:, members]
     every = np.concatenate([np.ones((1, recorded.size)), drawn])
@@ -289,7 +292,7 @@ def _with_mean(recorded: IndexArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _needless_s(drives: CornerDrives, approached: FloatArray, empty: FloatArray) -> FloatArray:
-    """Return needless braking a corner in the mean and in every draw, shape (1 + draws, shares)."""
+    """Return needless braking per corner, the mean and every draw, shape (1 + draws, shares)."""
     met = np.r_[drives.loud.needless_s, drives.quiet.needless_s]
     share = np.array(SHARES)
     return np.outer(approached @ met, share) + np.outer(empty @ drives.empty.needless_s, 1.0 - share)
@@ -325,7 +328,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLOURS = dict(zip((UNAWARE, FULL, PHANTOM, CHANCE, LOUD), CATEGORIES, strict=False))
-_COLOURS[MEMORY] = _COLOURS[PHANTOM]  # Both drive alike where sight only grows
+_COLOURS[MEMORY] = _COLOURS[PHANTOM]  # Both drive alike if sight only grows
 _TOLD = {UNAWARE: "no knowledge", PHANTOM: "phantom at every corner", FULL: "phantom, full brakes"}
 _ARM_M, _BEHIND_M, _BEYOND_M = 13.0, 9.0, 2.0
 
@@ -350,7 +353,7 @@ def write_planner_figure(
 def _draw_corner(
     axes: "Axes", met: Encounters, i: int, planners: Mapping[str, CornerDrives], ego: EgoVehicle
 ) -> None:
-    """Draw the first moment at which the planners without knowledge and with it are a metre apart."""
+    """Draw the first moment at which the planners with and without knowledge are a metre apart."""
     from matplotlib.patches import Rectangle
 
     apart = planners[UNAWARE].loud.front_m[i] - planners[CHANCE].loud.front_m[i]
@@ -373,11 +376,11 @@ def _draw_corner(
         axes.add_patch(Rectangle(corner, met.length_m[i, k], met.width_m[i, k], color=TRUTH))
     far = met.lane_m[i].max() + _BEYOND_M
     axes.set(xlim=(_ARM_M, -_ARM_M), ylim=(-_BEHIND_M, far), aspect="equal")
-    axes.set(xlabel="left, m", ylabel="ahead, m", title="a vehicle that neither of them sees yet")
+    axes.set(xlabel="left, m", ylabel="ahead, m", title="a vehicle that neither of them can see yet")
 
 
 def _draw_speeds(axes: "Axes", empty: Encounters, planners: Mapping[str, CornerDrives]) -> None:
-    # The corner at which the planner that listens brakes as long as in the mean: no picked one.
+    # The corner at which the planner with the chances brakes for the median time: a typical one.
     braking = planners[CHANCE].empty.braking_s
     i = int(np.abs(braking - np.median(braking)).argmin())
     for name, told in (*_TOLD.items(), (CHANCE, "chance of the state")):
@@ -405,4 +408,4 @@ def _draw_costs(
         axes.plot(*place(one), "o", color=_COLOURS[name], markersize=8, clip_on=False, label=told)
     axes.legend(loc="upper right", fontsize=8)
     axes.set(xlabel=f"needless braking, s ({SHARES[0]:.0%} with a vehicle)", xlim=(0.0, None))
-    axes.set(ylabel="collisions in 1,000 approaches", ylim=(0.0, None), title="what each threshold costs")
+    axes.set(ylabel="collisions in 1,000 approaches", ylim=(0.0, None), title="cost of each threshold")

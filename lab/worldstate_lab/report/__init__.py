@@ -1,1 +1,1 @@
-"""Tables and figures of every study, and how they become text, JSON, CSV, pages and results."""
+"""Tables and figures of every study, and their output as text, JSON, CSV, pages and results."""

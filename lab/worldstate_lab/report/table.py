@@ -1,9 +1,9 @@
-"""The one table that every study fills: printed, written as JSON and CSV, and set into a page.
+"""The table type of all studies: printed, written as JSON and CSV, and inserted into pages.
 
-A study returns its findings as `Table` values, and as `Figure` values where a picture is drawn. A command
-prints ``table.lines()``, puts ``plain(findings)`` into its JSON report and writes ``table.csv()``; a
-`Document` sets tables and figures into `report.md`: a page of Markdown with its figures and numbers as files,
-all or nothing.
+A study returns its findings as `Table` values, and its pictures as `Figure` values. A command prints
+``table.lines()``, includes ``plain(findings)`` in its JSON report and writes ``table.csv()``. A `Document`
+combines tables and figures in `report.md`, a Markdown page with its figures and numbers as files; all files
+are written, or none.
 """
 
 import csv
@@ -33,7 +33,7 @@ _PARTS = ("value", "low", "high", "note", "paper", "paper_low", "paper_high")
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A number with its interval and the paper's beside it; NaN where there is none.
+    """A number with its interval and the paper's value; NaN if there is none.
 
     Examples
     --------
@@ -47,17 +47,17 @@ class Value:
     low: float = math.nan
     high: float = math.nan
     digits: int = 2
-    note: str = ""  # Printed after the value, or in its place
+    note: str = ""  # Printed after the value, or instead of it
     paper: "Value | None" = None
 
     @property
     def number(self) -> str:
-        """Value alone, rounded; its note, or a dash, where there is none."""
+        """The rounded value; if there is none, its note or a dash."""
         return self._rounded(self.value) if math.isfinite(self.value) else self.note or MISSING
 
     @property
     def interval(self) -> str:
-        """Interval alone, empty where there is none."""
+        """The interval, empty if there is none."""
         if not all(map(math.isfinite, (self.value, self.low, self.high))):
             return ""
         return f"[{self._rounded(self.low)}, {self._rounded(self.high)}]"
@@ -69,11 +69,11 @@ class Value:
         return " ".join(filter(None, (self.number, self.interval, note)))
 
     def _rounded(self, value: float) -> str:
-        # A rounded -0.001 would print as -0.00; adding zero takes the sign away.
+        # A rounded -0.001 would print as -0.00; adding zero removes the sign.
         return f"{round(value, self.digits) + 0.0:.{self.digits}f}"
 
 
-# A float without an interval is printed with three decimals, one that is not known (None, NaN) as a dash.
+# A float without an interval is printed with three decimals, an unknown one (None, NaN) as a dash.
 Cell: TypeAlias = Value | str | float | None
 
 
@@ -94,7 +94,7 @@ def cell_text(cell: Cell) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Named columns, which carry their units, and rows of cells; the name is that of its CSV file.
+    """Named columns with their units, and rows of cells; `name` is also that of the CSV file.
 
     Examples
     --------
@@ -115,19 +115,19 @@ class Table:
     caption: str = ""
 
     def lines(self) -> list[str]:
-        """Return the title and the aligned columns for a terminal; the caption is left to pages."""
+        """Return the title and the aligned columns for a terminal; the caption is used only on pages."""
         texts = [list(self.columns), *([cell_text(cell) for cell in row] for row in self.rows)]
         widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
         return [self.title, *(_aligned(row, widths) for row in texts)]
 
     def csv(self) -> str:
-        """Return the numbers to the last digit."""
+        """Return the numbers with full precision."""
         return csv_text(self.columns, self.rows)
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One picture with the numbers behind it; `draw` is given an empty figure of matplotlib."""
+    """One picture with its numbers; `draw` receives an empty matplotlib figure."""
 
     name: str
     title: str
@@ -138,7 +138,7 @@ class Figure:
     size_in: tuple[float, float] = (4.4, 3.7)
 
     def csv(self) -> str:
-        """Return the numbers to the last digit."""
+        """Return the numbers with full precision."""
         return csv_text(self.columns, self.rows)
 
 
@@ -146,7 +146,7 @@ Block: TypeAlias = Table | Figure
 
 
 def csv_text(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """Return rows as CSV; a column of values becomes one column for each part that any of them has.
+    """Return rows as CSV; a column of values becomes one column for each part that occurs.
 
     Examples
     --------
@@ -162,7 +162,7 @@ def csv_text(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
 
 
 def figure_lines(columns: Mapping[str, Mapping[str, float | None]], form: str = ".3g") -> list[str]:
-    """Return figures for a terminal, each in a row; whole numbers in full, a dash for what is not known.
+    """Return figures for a terminal, one per row; whole numbers in full, a dash for unknown values.
 
     Examples
     --------
@@ -188,7 +188,7 @@ def _figure_text(value: float | None, form: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return findings as JSON-able values: dataclasses, tuples and arrays in any depth, null for NaN.
+    """Return findings as JSON-compatible values: nested dataclasses, tuples and arrays, null for NaN.
 
     Examples
     --------
@@ -212,7 +212,7 @@ def plain(value: Any) -> Any:
 
 
 def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
-    """Return a line with the first column to the left and the numbers to the right."""
+    """Return a line with the first column left-aligned and the numbers right-aligned."""
     cells = [
         row[0].ljust(widths[0]),
         *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
@@ -221,11 +221,11 @@ def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _split(title: str, cells: Sequence[Cell]) -> Iterable[list[float | str]]:
-    """Return the columns of a CSV file that a column of cells becomes, each with its head."""
+    """Return the CSV columns for a column of cells, each with its head."""
     if not any(isinstance(cell, Value) for cell in cells):
         return [[title, *map(_written, cells)]]
     rows = [[_written(part) for part in _parts(cell)] for cell in cells]
-    # The first part stays even where no row knows it: a column that was measured and found empty.
+    # The first part is kept even if all rows lack it: the column was measured but has no values.
     kept = [i for i in range(len(_PARTS)) if i == 0 or any(row[i] != "" for row in rows)]
     return [[f"{title} {_PARTS[i]}", *(row[i] for row in rows)] for i in kept]
 
@@ -234,7 +234,7 @@ def _parts(cell: Cell) -> tuple[Cell, ...]:
     if not isinstance(cell, Value):
         return (cell, *[None] * (len(_PARTS) - 1))
     paper = cell.paper or Value(math.nan)
-    # The note of an unknown value stands in its place, as in the report.
+    # The note of an unknown value replaces it, as in the report.
     value, note = (cell.note, "") if math.isnan(cell.value) else (cell.value, cell.note)
     return value, cell.low, cell.high, note, paper.value, paper.low, paper.high
 
@@ -242,13 +242,13 @@ def _parts(cell: Cell) -> tuple[Cell, ...]:
 def _written(cell: Cell) -> float | str:
     if cell is None or (isinstance(cell, float) and math.isnan(cell)):
         return ""
-    # The writer does not quote a lone carriage return, and readers end the row there.
+    # The CSV writer does not quote a lone carriage return, but readers end the row there.
     return " ".join(cell.split()) if isinstance(cell, str) else cell  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading, its paragraphs, then tables and figures, then the sections below it."""
+    """A heading with paragraphs, tables and figures, and subsections."""
 
     title: str
     text: tuple[str, ...] = ()
@@ -256,7 +256,7 @@ class Section:
     subsections: "tuple[Section, ...]" = ()
 
     def walk(self, level: int) -> "Iterator[tuple[int, Section]]":
-        """Yield this section and those below it in the order of reading, each with its level."""
+        """Yield this section and its subsections in reading order, each with its level."""
         yield level, self
         for one in self.subsections:
             yield from one.walk(level + 1)
@@ -264,7 +264,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A whole report; the facts (versions, seeds, settings) stand at its end."""
+    """A whole report; the facts (versions, seeds, settings) are at its end."""
 
     title: str
     lead: str
@@ -272,18 +272,18 @@ class Document:
     facts: tuple[tuple[str, str], ...] = ()
 
     def walk(self) -> Iterator[tuple[int, Section]]:
-        """Yield every section in the order of reading, with the level of its heading."""
+        """Yield every section in reading order, with the level of its heading."""
         for section in self.sections:
             yield from section.walk(2)
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Every table and figure, in the order of reading."""
+        """Every table and figure, in reading order."""
         return tuple(block for _, section in self.walk() for block in section.blocks)
 
 
 def markdown_page(document: Document, files: str) -> str:
-    """Return the text; pictures and numbers lie in the folder `files` beside it.
+    """Return the text; pictures and numbers are in the folder `files` beside it.
 
     Examples
     --------
@@ -330,7 +330,7 @@ def _markdown_cell(cell: Cell) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return text in which nothing is markup; a line break would end a row of a table."""
+    """Return text without active markup; a line break would end a row of a table."""
     one_line = " ".join(text.split())
     return re.sub(r"([\\`*_|~])|\[(?=[^\]]*\]\()", lambda m: "\\" + m.group(0), one_line).replace("<", "&lt;")
 
@@ -339,20 +339,21 @@ PAGE, FILES = "report.md", "report_files"
 
 
 def write_document(document: Document, folder: Path) -> None:
-    """Write `report.md` and `report_files/` into an existing folder, all or nothing.
+    """Write `report.md` and `report_files/` into an existing folder, both or neither.
 
     Raises
     ------
     InputFileError
-        If one of the names is taken by something else, or the folder is missing or not writable.
+        If another file has one of the names, or the folder is missing or not writable.
     """
     check_target(folder / PAGE)
     if (folder / FILES).exists() and not (folder / FILES).is_dir():
-        raise InputFileError(folder / FILES, "expected a folder of an earlier report, or nothing")
+        raise InputFileError(folder / FILES, "expected a folder of an earlier report, or none")
     with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as temporary:
         new = Path(temporary)
         _write_all(document, new)
-        # A page of one run beside pictures of another would be worse than none: no signal between the moves.
+        # A page of one run must not be combined with pictures of another: signals are deferred between the
+        # moves.
         with deferred_signals():
             if (folder / FILES).exists():
                 (folder / FILES).rename(new / "before")
@@ -372,5 +373,5 @@ def _write_all(document: Document, folder: Path) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    # A file name that is no UTF-8 comes in with surrogates, which cannot be written.
+    # A file name that is not UTF-8 contains surrogates, which cannot be written.
     path.write_text(text, encoding="utf-8", errors="replace")
