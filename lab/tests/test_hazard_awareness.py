@@ -228,7 +228,7 @@ def test_recordings_are_chosen_evenly_and_what_is_missing_is_named(tmp_path):
         f"1 of 3 approaches with video are missing: no {VIDEO_NAME} or no detections beside leftSA19",
         "2 of 2 hazard-free recordings with video are missing",
     )
-    assert "hazard-free recordings are missing" in few.lacks
+    assert "hazard-free recordings with video are missing" in few.lacks
     assert chosen.lacks is None
     takes = tuple(Take.of(one) for one in [*whole, dark])
     full = whole_sweep(TakeList(tmp_path, takes, (), (), False), DegradationSettings(motion_detectors()))

@@ -152,7 +152,7 @@ def test_whatever_is_said_no_car_brakes_or_accelerates_beyond_its_limits(seed: i
 def test_streams_without_what_is_asked_for_are_refused() -> None:
     with pytest.raises(InvalidArgumentError, match="60 replays of approaches"):
         draw_corners([EVERY[2]], 60, EgoVehicle(), np.random.default_rng(0))
-    with pytest.raises(InvalidArgumentError, match="60 moments without vehicles"):
+    with pytest.raises(InvalidArgumentError, match="60 times without vehicles"):
         draw_corners([EVERY[0]], 60, EgoVehicle(), np.random.default_rng(0))
 
 

@@ -76,7 +76,7 @@ def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, tmp_path, cap
     differences = [one["differences"]["detection"] for one in again["against"]]
     assert differences and all(value == [0.0, 0.0, 0.0] for value in differences)
     said = capsys.readouterr().out
-    assert "less the other evaluation" in said and "not heard: cut:" in said
+    assert "minus the other evaluation" in said and "not processed: cut:" in said
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys
     assert main(["table", "--smoke", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "2 approaches with a T0, found 1" in said
-    assert f"not heard: {sound.parent.name}: " in said and "cut short" in said
+    assert f"not processed: {sound.parent.name}: " in said and "cut short" in said
     assert not (tmp_path / "report.md").exists()
 
 

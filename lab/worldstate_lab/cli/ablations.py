@@ -40,13 +40,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set or hop streams")
     add_array_options(parser)
-    add("--model", type=Path, help="model file (default: the one that ships)")
+    add("--model", type=Path, help="model file (default: the shipped one)")
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
-    add("--boxes", nargs="+", default=["boxes"], metavar="DIR", help="of a real corner (default: boxes)")
-    add("--path", choices=SPECTRA, default=SPECTRA[0], help="of a real corner (default: %(default)s)")
-    add("--miss-rates", type=Path, metavar="JSON", help="of the detector: one more row")
+    add("--boxes", nargs="+", default=["boxes"], metavar="DIR", help="at a real corner (default: boxes)")
+    add("--path", choices=SPECTRA, default=SPECTRA[0], help="path at a real corner (default: %(default)s)")
+    add("--miss-rates", type=Path, metavar="JSON", help="of the detector; adds a row")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--seed", type=int, default=0, help="deals the folds (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the folds (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:

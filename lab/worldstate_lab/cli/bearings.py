@@ -183,9 +183,9 @@ def street_bearings(heard: HeardStream) -> Bearings:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("--scenes", type=int, default=60, metavar="N", help="of rings (default: %(default)s)")
-    add("--streams", type=Path, nargs="+", metavar="NPZ", help="that were listened to, instead of rings")
-    add("--seed", type=int, default=1, help="of the scenes (default: %(default)s)")
+    add("--scenes", type=int, default=60, metavar="N", help="scenes with rings (default: %(default)s)")
+    add("--streams", type=Path, nargs="+", metavar="NPZ", help="processed streams, instead of rings")
+    add("--seed", type=int, default=1, help="seed of the scenes (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 

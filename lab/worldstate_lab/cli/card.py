@@ -52,9 +52,9 @@ FIGURES = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("model", type=Path, metavar="MODEL", help="its file")
-    add("--out", type=Path, required=True, metavar="FILE", help="of the model with its card; may be MODEL")
-    add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="for an exam")
+    add("model", type=Path, metavar="MODEL", help="model file")
+    add("--out", type=Path, required=True, metavar="FILE", help="model file with the card; may be MODEL")
+    add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="streams for an exam")
     add("--real", type=Path, metavar="JSON", help="results of `worldstate-lab sequences`")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
@@ -84,7 +84,7 @@ def with_real(model: Model, results: Mapping[str, Any]) -> Model:
     found = [one["figures"] for one in results.values()]
     whole = [one.keys() >= PATHS.keys() and "exam" in one["pair"] and one["start_s"] == 0.0 for one in found]
     if sum(whole) != 1:
-        expected = f"one run of `sequences` with {' and '.join(PATHS)}, from the start"
+        expected = f"one run of `sequences` with {' and '.join(PATHS)}, without --start"
         raise InvalidArgumentError(f"real: expected {expected}, got {sum(whole)}")
     record = [*results.values()][whole.index(True)]
     domain, rows = model.domain, list[RealFigure]()
@@ -97,7 +97,7 @@ def with_real(model: Model, results: Mapping[str, Any]) -> Model:
         for figure, (in_exam, in_record, places, name) in FIGURES.items():
             simulated = model.provenance.exam.get(in_exam) if own else figures["exam"][in_record]
             if simulated is None:
-                raise InvalidArgumentError("streams: expected those of an exam, the model's card has none")
+                raise InvalidArgumentError("streams: expected those of an exam; the model's card has none")
             real = reduce(getitem, places, figures)
             low, high = real[f"{name}_interval"]
             made = (ROOF, microphones, int(figures["recordings"]))

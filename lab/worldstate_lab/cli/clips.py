@@ -96,7 +96,7 @@ def _archived(path: Path, clips: int) -> tuple[FloatArray, IndexArray]:
         measures, clip = (np.asarray(arrays[name]) for name in ("character", "clip"))
         if measures.shape != (len(clip), NUMBERS) or not 0 <= clip.min() <= clip.max() < clips:
             raise InvalidArgumentError(
-                f"expected {NUMBERS} numbers of clips of the table, got {measures.shape}"
+                f"expected {NUMBERS} numbers per hop of the clips in the table, got {measures.shape}"
             )
         return measures.astype(np.float64), clip.astype(np.intp)
 
@@ -211,17 +211,17 @@ def clip_lines(report: Mapping[str, Any]) -> list[str]:
     for kind, one in report.get("realism", {}).items():
         apart = f"{one['simulated']:.3f} simulated to real, {one['real']:.3f} real to real"
         told = f"classifier {one['simulated_c2st']:.2f}, {one['real_c2st']:.2f}"
-        lines.append(f"{kind:18} numbers apart: {apart}; {told}")
+        lines.append(f"{kind:18} distance: {apart}; {told}")
     if report["kinds_log_loss"] is None:
-        return [*lines, "road users: the table names none"]
+        return [*lines, "road users: the table contains none"]
     said = report["said_90"]
     right = "-" if said["right"] is None else f"{said['right']:.2f}"
     losses = (
-        f"log-loss {report['kinds_log_loss']:.3f}, of the table's shares {report['kinds_log_loss_prior']:.3f}"
+        f"log-loss {report['kinds_log_loss']:.3f}, by the table's shares {report['kinds_log_loss_prior']:.3f}"
     )
     return [
         *lines,
-        f"road users: {losses}; said {SAID} or more in {said['share']:.2f} of the hops, right {right}",
+        f"road users: {losses}; probability {SAID} or more in {said['share']:.2f} of the hops, right {right}",
     ]
 
 
@@ -229,16 +229,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("table", type=Path, metavar="TABLE.csv", help="file, kind, recording, road_user")
-    add("--numbers", type=Path, metavar="NPZ", help="what was heard of the clips, in place of their files")
-    add("--model", type=Path, metavar="FILE", help="(default: the model that ships)")
+    add("--numbers", type=Path, metavar="NPZ", help="stored numbers of the clips, instead of their files")
+    add("--model", type=Path, metavar="FILE", help="(default: the shipped model)")
     add(
         "--simulated",
         type=int,
         default=0,
         metavar="N",
-        help="clips of each kind to hold against the real ones",
+        help="simulated clips of each kind, compared with the real ones",
     )
-    add("--seed", type=int, default=0, help="of simulated clips (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of simulated clips (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:

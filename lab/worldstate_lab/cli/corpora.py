@@ -95,7 +95,7 @@ def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
             axes.plot(row.paper, [place] * 2, "|-", color=CATEGORIES[3], ms=11, mew=2.5, label="paper")
     axes.set_yticks(places, [f"{row.name}\n{row.corpus}" for row in rows], fontsize=7.0)
     axes.axvline(CHANCE, color="grey", linewidth=0.8, linestyle=":", label="chance")
-    axes.set(xlim=(0.0, 1.03), xlabel="AUROC; balanced accuracy where the bar is orange")
+    axes.set(xlim=(0.0, 1.03), xlabel="AUROC; balanced accuracy if the bar is orange")
     axes.margins(y=0.01)
     legend_beside(axes)
 
@@ -118,13 +118,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--melaudis", type=Path, metavar="DIR", help="MELAUDIS, both archives unpacked")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(NAMES)}")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--seed", type=int, default=0, help="folds and bootstrap (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of folds and bootstrap (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
     if arguments.idmt is None and arguments.melaudis is None:
-        raise InvalidArgumentError("expected --idmt, --melaudis or both: the folders of published corpora")
+        raise InvalidArgumentError("expected --idmt, --melaudis or both: folders of the published corpora")
     if arguments.out is not None:
         output_folder(arguments.out, *NAMES)
     # The second generator of two, as when the first simulated clips: folds and draws stay the same.
@@ -154,5 +154,5 @@ def _heard(name: str, clips: list[TrafficClip] | None, jobs: int) -> ClipSignatu
 
     if clips is None:
         return None
-    with progress_bar(f"listening to {name}", len(clips)) as bar:
+    with progress_bar(f"processing {name}", len(clips)) as bar:
         return hear_clips(name, clips, jobs, bar.advance)

@@ -142,10 +142,10 @@ SITES = 3  # Minimum: one evaluated site and two that set its threshold
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    heard = f"simulated streams that were listened to, of {SITES} sites or more"
+    heard = f"processed simulated streams of {SITES} sites or more"
     add("streams", type=Path, nargs="+", metavar="NPZ", help=heard)
-    add("--sounds", type=int, default=2, metavar="N", help="of each kind at each site (default: %(default)s)")
-    add("--seed", type=int, default=0, help="what sounds where (default: %(default)s)")
+    add("--sounds", type=int, default=2, metavar="N", help="of each kind per site (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the sounds (default: %(default)s)")
     add("--out", type=Path, metavar="DIR", help=f"write {', '.join(NAMES)}")
 
 

@@ -124,11 +124,11 @@ def _examined(near: RoadUserRows, said: FloatArray, weights: FloatArray, shares:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("--junctions", type=int, default=16, metavar="N", help="drawn ones (default: %(default)s)")
-    of_each = "of each kind at each of them (default: %(default)s)"
+    add("--junctions", type=int, default=16, metavar="N", help="random junctions (default: %(default)s)")
+    of_each = "passes of each kind per junction (default: %(default)s)"
     add("--passes", type=int, default=2, metavar="N", help=of_each)
-    add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="that were listened to")
-    add("--seed", type=int, default=0, help="of vehicles and drives (default: %(default)s)")
+    add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="processed streams")
+    add("--seed", type=int, default=0, help="seed of vehicles and drives (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 

@@ -82,17 +82,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add_array_options(parser, "OVAD's")
-    add("--streams", type=Path, required=True, metavar="D", help="folder of what is listened to")
-    add("--moving-ego", action="store_true", help="drives up to the corner, in place of an ego that stands")
-    add("--junctions", type=int, default=12, metavar="N", help="of each renderer (default: %(default)s)")
-    minutes = "of approaches at each; streams without hazards last in proportion (default: %(default)g)"
+    add("--streams", type=Path, required=True, metavar="D", help="folder of the processed streams")
+    add("--moving-ego", action="store_true", help="the ego drives up to the corner instead of standing")
+    add("--junctions", type=int, default=12, metavar="N", help="number per renderer (default: %(default)s)")
+    minutes = "minutes with approaches per junction; hazard-free streams in proportion (default: %(default)g)"
     add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
-    onsets = "an hour at which shares are compared (default: 30, of a moving ego 40)"
+    onsets = "onsets per hour for the comparison (default: 30, with a moving ego 40)"
     add("--onsets", type=float, metavar="N", help=onsets)
-    add("--labelled", type=Path, metavar="CSV", help="labelled windows of this array, learned too")
-    ids = "CSV files with a column ID: leave out the recordings of these labelled windows"
+    add("--labelled", type=Path, metavar="CSV", help="labelled windows of this array, also for training")
+    ids = "CSV files with a column ID: exclude the labelled windows of these recordings"
     add("--exclude", type=Path, nargs="+", default=[], metavar="IDS", help=ids)
-    add("--seed", type=int, default=1, help="of the streams and of the trees (default: %(default)s)")
+    add("--seed", type=int, default=1, help="seed of streams and trees (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         array = adapters.read_array(arguments.array, arguments.array_axes)
     plan, streams = learned_streams(settings), list[HeardStream]()
     if not any(one.traffic.hazard_free and not one.traffic.name.startswith(MISLEADING) for one in plan):
-        raise InvalidArgumentError("--junctions: expected 3 or more, of fewer no traffic sets the threshold")
+        raise InvalidArgumentError("--junctions: expected 3 or more to set the threshold")
     rng, own = np.random.default_rng(settings.seed), own_windows(array, settings, _labelled(arguments))
     fit = fit_of(windows_to_learn(array, settings, *own, rng, arguments.jobs))
     with progress_bar("listening", sum(one.minutes for one in plan)) as bar:

@@ -51,7 +51,7 @@ BENCHES = {
 }
 DESCRIPTION = "The evaluation of the paper, and further studies."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"
-GROUPS = {"bench": "costs and accuracies of parts of the library, beside peers"}
+GROUPS = {"bench": "costs and accuracies of parts of the library, compared with peers"}
 PROGRAM = Program(
     "worldstate-lab", DESCRIPTION, EPILOG, STUDIES | CORNER | BENCHES, GROUPS, hidden=("bench",)
 )

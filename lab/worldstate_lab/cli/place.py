@@ -292,11 +292,9 @@ def _rms(errors_m: FloatArray) -> float:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add(
-        "trials", type=Path, nargs="*", metavar="CSV", help="spatial spectra, Site1_L_15_Trial2.csv and so on"
-    )
+    add("trials", type=Path, nargs="*", metavar="CSV", help="spatial spectra, such as Site1_L_15_Trial2.csv")
     add("--passes", type=int, default=30, help="simulated passes (default: %(default)s)")
-    add("--seed", type=int, default=0, help="draws the passes (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the passes (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -313,7 +311,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
             means = {name: sum(one[name] for one in scored) / len(scored) for name in _COLUMNS}
             report[f"mean_of_{title}"] = means | {"worst_rmse_m": max(one["rmse_m"] for one in scored)}
             rows.append(_row(f"{title}, mean of {len(scored)}", means))
-    table = Table("places", f"{exam.ms_a_hop:.2f} ms a hop", ("pass", *_COLUMNS.values()), rows)
+    table = Table("places", f"{exam.ms_a_hop:.2f} ms per hop", ("pass", *_COLUMNS.values()), rows)
     return CommandResult(report, table={}, lines=table.lines())
 
 

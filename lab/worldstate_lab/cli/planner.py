@@ -43,20 +43,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("streams", type=Path, nargs="+", metavar="NPZ", help="streams with and without approaches")
     set_on = parser.add_mutually_exclusive_group(required=True)
-    of_others = "streams of other seeds: a step below the largest chance up to which no vehicle is hit there"
+    of_others = "streams of other seeds, for the threshold: a step below the largest without a collision"
     set_on.add_argument("--set-on", type=Path, nargs="+", metavar="NPZ", help=of_others)
-    chance = "chance within three seconds from which on a vehicle is assumed"
+    chance = "chance within three seconds at which a vehicle is assumed"
     set_on.add_argument("--threshold", type=float, metavar="P", help=chance)
-    add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
+    add("--model", type=Path, metavar="JSON", help="model with a sequence (default: the shipped one)")
     add("--count", type=int, default=1000, help="approaches, and corners without one (default: %(default)s)")
     standing = (
-        "the car begins at rest 3.5 m before the line, where the states were recorded, not 30 m at 25 km/h"
+        "the car starts at rest 3.5 m before the line, where the states were recorded, not 30 m at 25 km/h"
     )
     add("--from-standing", action="store_true", help=standing)
-    add("--cache", type=Path, metavar="DIR", help="keep what the filter said of each stream here")
-    add("--seed", type=int, default=0, help="of the replays (default: %(default)s)")
+    add("--cache", type=Path, metavar="DIR", help="folder for the chances of each stream")
+    add("--seed", type=int, default=0, help="seed of the replays (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--figure", type=Path, metavar="PNG", help="draw a corner, a way through one, and all thresholds")
+    add("--figure", type=Path, metavar="PNG", help="draw one approach, one empty corner, and all thresholds")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:

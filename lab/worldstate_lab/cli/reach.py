@@ -94,11 +94,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_choice(parser, "--method", "", "worldstate", "baseline")
     add("--recordings", type=Path, metavar="DATASET", help="labelled recordings")
     add("--band", type=float, nargs=2, default=[300.0, 1800.0], metavar="HZ", help="(default: 300 1800)")
-    add("--snr-db", type=float, default=-10.0, metavar="DB", help="in each bin (default: %(default)g)")
-    add("--snapshots", type=int, default=20, metavar="N", help="independent ones (default: %(default)s)")
+    add("--snr-db", type=float, default=-10.0, metavar="DB", help="SNR in each bin (default: %(default)g)")
+    add("--snapshots", type=int, default=20, metavar="N", help="number of snapshots (default: %(default)s)")
     add("--camera-std", type=float, default=1.0, metavar="DEG", help="of its bearings (default: %(default)g)")
-    add("--seed", type=int, default=0, help="folds and bootstrap (default: %(default)s)")
-    add("--figure", type=Path, metavar="PNG", help="draw what was found")
+    add("--seed", type=int, default=0, help="seed of folds and bootstrap (default: %(default)s)")
+    add("--figure", type=Path, metavar="PNG", help="draw the results")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -154,5 +154,5 @@ def _lines(array: ReachOfArray, data: ReachOnData | None, bands: BandProfile | N
             bands.edges_hz[:-1], bands.edges_hz[1:], bands.by_level, bands.by_shape, strict=True
         ):
             lines.append(f"{low:7.0f} - {high:6.0f} {ratios[0]:10.3g} {ratios[1]:10.3g}")
-        lines.append("shape tells most from {:.0f} to {:.0f} Hz".format(*bands.range_hz))
+        lines.append("shape is most informative from {:.0f} to {:.0f} Hz".format(*bands.range_hz))
     return lines

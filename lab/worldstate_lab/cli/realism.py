@@ -127,7 +127,7 @@ def _draw_key(axes: "Axes") -> None:
     for origin, colour in COLOURS.items():
         axes.plot([], [], "o-", color=colour, label=origin)
     axes.axis("off")
-    axes.legend(loc="center", title="median, middle 50 and 90 % of windows;\na line a junction below")
+    axes.legend(loc="center", title="median, central 50 and 90 % of windows;\none line per junction below")
 
 
 Pair = tuple[FeatureTable, FeatureTable | None]
@@ -144,9 +144,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_choice(parser, "--group", "windows of a standing or a moving ego", "static", "dynamic")
     add("--sites", nargs="+", metavar="SITE", help="only these junctions (default: all of the table)")
     add("--simulated", type=Path, nargs="+", metavar="CSV", help="simulated windows, instead of simulating")
-    add("--permuted", type=Path, nargs="+", metavar="CSV", help="the same windows, positions permuted")
-    add("--measures-only", action="store_true", help="no classifier: what streets are tuned on (a second)")
-    add("--real-only", action="store_true", help="real against real alone")
+    add("--permuted", type=Path, nargs="+", metavar="CSV", help="the same windows with permuted positions")
+    add("--measures-only", action="store_true", help="no classifiers, as in the tuning of streets (a second)")
+    add("--real-only", action="store_true", help="only real against real")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--out", type=Path, metavar="DIR", help="write realism.json, realism.png and windows")
 
@@ -190,7 +190,7 @@ def _simulated(arguments: argparse.Namespace, real: FeatureTable) -> dict[str, P
         return {}
     if arguments.simulated:
         if len(arguments.permuted or arguments.simulated) != len(arguments.simulated):
-            raise InvalidArgumentError("--permuted: expected as many tables as --simulated has")
+            raise InvalidArgumentError("--permuted: expected as many tables as for --simulated")
         tables = zip_longest(arguments.simulated, arguments.permuted or ())
         return {
             right.stem: (_chosen(right, arguments), None if wrong is None else _chosen(wrong, arguments))

@@ -55,12 +55,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add, sites = parser.add_argument, ["SA2", "SB2", "TA911", "TB912"]
     add("names", nargs="*", metavar="NAME", choices=[[], *SCENARIOS], help="scenarios (default: all)")
-    add("--streams", type=Path, required=True, metavar="D", help="folder of what is listened to")
-    add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
-    add("--budget", type=float, metavar="N", help="onsets an hour (default: that of the model)")
+    add("--streams", type=Path, required=True, metavar="D", help="folder of the processed streams")
+    add("--model", type=Path, metavar="JSON", help="model with a sequence (default: the shipped one)")
+    add("--budget", type=float, metavar="N", help="onsets per hour (default: the model's)")
     add("--sites", nargs="+", default=sites, metavar="SITE", help=f"junctions (default: {' '.join(sites)})")
-    add("--minutes", type=float, default=10.0, help="of each stream (default: %(default)g)")
-    add("--seed", type=int, default=9100, help="of the first junction (default: %(default)s)")
+    add("--minutes", type=float, default=10.0, help="length of each stream (default: %(default)g)")
+    add("--seed", type=int, default=9100, help="seed of the first junction (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 def followed(settings: StreamSettings, model: Model, folder: Path) -> Followed:
     """Return a stream with the filter's output, rendered unless it is in the folder."""
     if model.domain is None:
-        raise InvalidArgumentError("model: expected one that names its array, got one that names none")
+        raise InvalidArgumentError("model: expected one with an array, got one without")
     path, array = folder / f"{settings.name}-{settings.minutes:g}.npz", array_of(model.domain)
     if not path.is_file():
         hear_stream(settings, [array])[0].save(path)

@@ -64,19 +64,19 @@ from worldstate_lab.report.table import figure_lines
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("streams", type=Path, nargs="+", metavar="NPZ", help="streams that were listened to")
-    add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
-    cameras = "boxes of everybody, of cars above 100 pixels, none; dead from every T0 on"
+    add("streams", type=Path, nargs="+", metavar="NPZ", help="processed streams")
+    add("--model", type=Path, metavar="JSON", help="model with a sequence (default: the shipped one)")
+    cameras = "boxes of all vehicles, of cars above 100 px, none, or none from every T0 on"
     add("--camera", choices=("all", "cars", "none", "dies"), default="all", help=cameras)
     add(
         "--sides", action=argparse.BooleanOptionalAction, default=True,
-        help="learn what either arm sounds like from vehicles that come into view (default: on)",
+        help="learn the sound of each arm from vehicles that come into view (default: on)",
     )  # fmt: skip
-    add("--curve", type=Path, metavar="MODEL", help="write the model with the curve of these streams here")
-    add("--budget", type=float, metavar="N", help="its own, onsets an hour (default: that of the model)")
-    add("--promise", action="store_true", help="hold these streams against the curve of the model")
-    add("--days", type=int, default=0, metavar="N", help="of each kind, drawn from the streams")
-    add("--seed", type=int, default=0, help="of the camera's misses and of days (default: %(default)s)")
+    add("--curve", type=Path, metavar="MODEL", help="write the model with the alarm curve of these streams")
+    add("--budget", type=float, metavar="N", help="its budget, onsets per hour (default: the model's)")
+    add("--promise", action="store_true", help="test the curve of the model on these streams")
+    add("--days", type=int, default=0, metavar="N", help="days of each kind, drawn from the streams")
+    add("--seed", type=int, default=0, help="seed of camera misses and days (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
@@ -97,8 +97,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     added, sides, quiet = hearing_allows(every), sides_by_risk(every), onsets_by_traffic(every)
     report = {**given, "junctions": columns, "second_adds_db": added, "sides_by_risk": sides}
     report["hazard_free"] = quiet
-    lines = ["dB that a second vehicle adds, so long before its own T0", *figure_lines(added, ".1f"), ""]
-    lines += [*figure_lines(columns, ".3f"), "", "sides named by risk", *figure_lines(sides, ".3f")]
+    lines = ["dB that a second vehicle adds, by time before its own T0", *figure_lines(added, ".1f"), ""]
+    lines += [*figure_lines(columns, ".3f"), "", "sides announced by risk", *figure_lines(sides, ".3f")]
     lines += ["", "without hazards", *figure_lines(quiet, ".3f")]
     alarm = parts_of(model)[1].alarm
     if days and alarm is not None:

@@ -208,9 +208,9 @@ def street_numbers(facts: Facts) -> dict[str, float]:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("streams", type=Path, nargs="+", metavar="NPZ", help="streams with vehicles out of hidden arms")
-    add("--sequences", type=Path, metavar="DIR", help="a real corner, for the numbers of camera and side")
-    add("--model", type=Path, metavar="JSON", help="with a sequence; the one that ships otherwise")
+    add("streams", type=Path, nargs="+", metavar="NPZ", help="streams with vehicles from hidden arms")
+    add("--sequences", type=Path, metavar="DIR", help="a real corner, for the parameters of camera and side")
+    add("--model", type=Path, metavar="JSON", help="model with a sequence (default: the shipped one)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:

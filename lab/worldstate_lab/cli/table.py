@@ -94,21 +94,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, nargs="?", metavar="DATASET", help="recordings (default: simulated streets)")
     add("--out", type=Path, default=Path("evaluation"), metavar="DIR", help="(default: %(default)s)")
-    add("--features", type=Path, metavar="CSV", help="windows to train the published classifier on")
-    add("--model", type=Path, metavar="FILE", help="this library's model (default: the one that ships)")
-    add("--static-ids", type=Path, metavar="CSV", help="tested recordings of a standing ego")
-    add("--dynamic-ids", type=Path, metavar="CSV", help="tested recordings of a moving ego")
-    add("--hazard-free", type=Path, nargs="+", default=[], metavar="PATH", help="more time without a vehicle")
-    add("--hazard-free-hours", type=float, metavar="H", help="score so many hours of it (default: all)")
-    add("--stage-streams", action="store_true", help="let camera and rain fail on the streams of it, too")
+    add("--features", type=Path, metavar="CSV", help="training windows of the published classifier")
+    add("--model", type=Path, metavar="FILE", help="this library's model (default: the shipped one)")
+    add("--static-ids", type=Path, metavar="CSV", help="test recordings of a standing ego")
+    add("--dynamic-ids", type=Path, metavar="CSV", help="test recordings of a moving ego")
+    add("--hazard-free", type=Path, nargs="+", default=[], metavar="PATH", help="sound without a vehicle")
+    add("--hazard-free-hours", type=float, metavar="H", help="hazard-free hours to score (default: all)")
+    add("--stage-streams", action="store_true", help="also stage camera failure and rain on these streams")
     add("--onnx-model", type=Path, metavar="ONNX", help="second detector (default: another without a model)")
     add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of that model")
-    add("--against", type=Path, metavar="DIR", help="a finished evaluation to compare this one with")
-    add("--seed", type=int, default=1, help="streets, folds, intervals (default: %(default)s)")
-    add("--full", action="store_true", help=f"folds drawn {FULL_SEEDS} times, all filmed recordings swept")
-    add("--smoke", action="store_true", help="four recordings: whether it runs, in a minute")
+    add("--against", type=Path, metavar="DIR", help="finished evaluation for a comparison")
+    add("--seed", type=int, default=1, help="seed of streets, folds, intervals (default: %(default)s)")
+    add("--full", action="store_true", help=f"{FULL_SEEDS} draws of folds, sweep over all videos")
+    add("--smoke", action="store_true", help="quick check on four recordings, one minute")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    add("--jobs", type=int, default=cores, help="processes (default: one a core)")
+    add("--jobs", type=int, default=cores, help="processes (default: one per core)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -178,7 +178,7 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.stage_streams and not arguments.hazard_free:
         raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
     if arguments.dataset is not None and arguments.smoke:
-        raise InvalidArgumentError("--smoke: expected no DATASET, it simulates four recordings")
+        raise InvalidArgumentError("--smoke: expected no DATASET, because it simulates four recordings")
 
 
 def _configuration(arguments: argparse.Namespace) -> list[tuple[str, str]]:
@@ -212,7 +212,7 @@ def _against_lines(compared: Sequence[Comparison]) -> list[str]:
         (one.protocol, one.method, one.shared, *(Value(*one.differences[name]) for name in COMPARED))
         for one in compared
     ]
-    table = Table("against", "less the other evaluation:", ("protocol", "method", "shared", *COMPARED), rows)
+    table = Table("against", "minus the other evaluation:", ("protocol", "method", "shared", *COMPARED), rows)
     return ["", *table.lines()] if rows else []
 
 
@@ -310,7 +310,7 @@ def _report(found: Evaluation, compared: Sequence[Comparison]) -> dict[str, obje
 
 def _lines(found: Evaluation) -> list[str]:
 
-    lines = [f"not heard: {one.name}: {one.problem}" for one in found.failed]
+    lines = [f"not processed: {one.name}: {one.problem}" for one in found.failed]
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
     tables = [] if found.degradation is None else sweep_tables(found.degradation)
     tables += [] if found.staged is None else [stream_table(found.staged)]

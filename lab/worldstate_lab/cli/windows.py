@@ -325,15 +325,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_table_options(parser)
     add_choice(parser, "--method", "", "worldstate", "baseline")
-    add_choice(parser, "--protocol", "what is held out", "cv", "lojo", "transfer")
-    add_choice(parser, "--reference", "what windows are compared with", "run", "cold", "curated")
-    add("--model", type=Path, help="evaluate this model file; no cross-validation")
-    only = "CSV file with a column ID: only recordings of these windows"
+    add_choice(parser, "--protocol", "unit that is held out", "cv", "lojo", "transfer")
+    add_choice(parser, "--reference", "reference of the windows", "run", "cold", "curated")
+    add("--model", type=Path, help="evaluate this model file without cross-validation")
+    only = "CSV file with a column ID: use only the windows of these recordings"
     add("--only", type=Path, metavar="IDS", help=only)
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
     add("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--predictions", type=Path, metavar="CSV", help="write one row a window and seed")
+    add("--predictions", type=Path, metavar="CSV", help="write one row per window and seed")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -367,7 +367,7 @@ def _passes(
     in_range("--seeds", arguments.seeds, 1, 10_000)
     afar = arguments.protocol == "transfer"
     if afar and arguments.group != "dynamic":
-        raise InvalidArgumentError("--protocol transfer: expected --group dynamic, static is learned from")
+        raise InvalidArgumentError("--protocol transfer: expected --group dynamic, training uses static")
     names = (row, *rows_beside(row, arguments.protocol, arguments.reference))
     methods = list(dict.fromkeys(ROWS[name].method for name in names))
     with progress_bar("evaluating", arguments.seeds * len(methods)) as bar:

@@ -67,26 +67,26 @@ AGAINST = {
     "update_600": "update_64",
     "state_20": "update_20",
 }
-"""Row of ours that does the work of a peer; of ours, what it is held against."""
+"""Our row that does the same work as a peer; for our rows, the reference."""
 SETTINGS = {
-    "stages": "56 channels, 47,998 Hz, Hann 512, hop 256, 18 or 19 new frames a hop; STFT bins 1-18; SRP "
+    "stages": "56 channels, 47,998 Hz, Hann 512, hop 256, 18 or 19 new frames per hop; STFT bins 1-18; SRP "
     "bins 3-18, 181 azimuths; feature bins 1-15, 30 azimuths x 2 halves; "
     "tone 20-400 Hz, 1 s at 1231 Hz, every hop",
     "sound_to_state": "the whole chain from the last 25 ms of a hop to its snapshot as JSON, with an image "
-    "of 968 x 304 px in which a car moves, by background subtraction, and what the terminal shows",
-    "published_chain": "per hop: scipy.signal.stft of the file, channel by channel, its cost shared among "
+    "of 968 x 304 px with a moving car, by background subtraction, and the terminal output",
+    "published_chain": "per hop: scipy.signal.stft of the file, channel by channel, its time shared among "
     "the hops; pyroomacoustics SRP, 30 azimuths, 50-1500 Hz (bins 1-15), on each half of one second; against "
     "stft + phat + feature",
     "listener_hop": "the same sound through a listener, hop by hop, to its snapshot as JSON, with the models "
     "of the roof array and no camera; against published_chain; _8: eight of the microphones in both",
-    "scikit_learn_trees": "the two rows of a hop through as many trees as training makes, as a "
+    "scikit_learn_trees": "the two rows of a hop through as many trees as training produces, as a "
     "histogram classifier; against sequence_reader, its inputs included",
     "scikit_learn_classifier": "the published linear machines on one window, without probabilities; against "
-    "window_evidence: five experts, each on the window and its mirror image, the site learned",
+    "window_evidence: five experts, each on the window and its mirror image, with a learned site reference",
     "jpda_1": "Stone Soup's JPDA on one vehicle in view; against the whole filter on the same boxes",
-    "update_20": "boxes of twenty vehicles; against predict and update of as many Kalman filters of four "
-    "states by einsum, their association known",
-    "update_600": "boxes of 600 objects an image, of which 64 count; against 64",
+    "update_20": "boxes of twenty vehicles; against predict and update of as many Kalman filters with four "
+    "states by einsum, with known association",
+    "update_600": "boxes of 600 objects per image, of which 64 are accepted; against 64",
     "state_20": "a snapshot of twenty vehicles; against their update",
 }
 """Frame-exact settings of the stages and of every comparison."""
@@ -94,7 +94,7 @@ SETTINGS = {
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--rounds", type=int, default=5, help="medians over so many (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="rounds per median (default: %(default)s)")
     parser.add_argument("--files", action="store_true", help="list the files of one hop and count its calls")
 
 

@@ -81,7 +81,7 @@ def _view(measured: Sequence[Measurement]) -> tuple[float, float]:
 
 
 def _unheard(one: Measurement) -> Measurement:
-    silent = NotUsable("not listened to")
+    silent = NotUsable("not measured")
     even = SignatureEvidence(one.signature.directions, (0.0, 0.0), 0.0, 0.0)
     return replace(one, signature=even, bearing=silent, approach=silent, sequence=None)
 
@@ -181,8 +181,8 @@ def report_of(paths: Sequence[Path], model: Model, seconds: float) -> dict[str, 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("streams", type=Path, nargs="+", metavar="NPZ")
-    parser.add_argument("--model", type=Path, help="with a sequence; the one that ships otherwise")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="of every stream; all otherwise")
+    parser.add_argument("--model", type=Path, help="model with a sequence (default: the shipped one)")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="of every stream (default: all)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:

@@ -23,7 +23,7 @@ STATEMENTS = (
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--rounds", type=int, default=7, help="the best of so many (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=7, help="runs; the best counts (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:

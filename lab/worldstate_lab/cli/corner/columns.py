@@ -44,12 +44,12 @@ from worldstate_lab.streets.column_distances import (
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("folder", type=Path, metavar="FOLDER", help="recordings of a corner")
-    add("--streams", type=Path, nargs="+", required=True, metavar="NPZ", help="simulated streams, as heard")
-    add("--path", choices=get_args(PathName), default="pair", help="what hears (default: %(default)s)")
-    add("--model", type=Path, metavar="FILE", help="of --path (default: pair/model.json, the one that ships)")
-    add("--statistics", action="store_true", help="medians and quartiles, too")
-    add("--seed", type=int, default=1, help="of halves and intervals (default: %(default)s)")
+    add("folder", type=Path, metavar="FOLDER", help="recordings of street corners")
+    add("--streams", type=Path, nargs="+", required=True, metavar="NPZ", help="processed simulated streams")
+    add("--path", choices=get_args(PathName), default="pair", help="sound input (default: %(default)s)")
+    add("--model", type=Path, metavar="FILE", help="of --path (default: pair/model.json or the shipped one)")
+    add("--statistics", action="store_true", help="also print medians and quartiles")
+    add("--seed", type=int, default=1, help="seed of halves and intervals (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
@@ -98,7 +98,7 @@ def _statistics_table(parts: Mapping[str, Sequence[Excerpt]]) -> Table:
         for i, column in enumerate(COMPARED)
         for name in names
     ]
-    title = "Medians and quartiles; levels in dB over the quiet street, evidence in nats, bearing in rad"
+    title = "Medians and quartiles; levels in dB above the quiet street, evidence in nats, bearing in rad"
     return Table("statistics", title, ("column", "statistic", *parts), rows)
 
 

@@ -298,10 +298,10 @@ def _shown(figures: Mapping[str, Any], name: str) -> str:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("folder", type=Path, metavar="FOLDER", help="truth.csv and the recordings it names")
-    add("--model", type=Path, required=True, metavar="FILE", help="made for the board, by model make")
+    add("folder", type=Path, metavar="FOLDER", help="truth.csv and its recordings")
+    add("--model", type=Path, required=True, metavar="FILE", help="model for the board, from model make")
     add("--array", type=Path, metavar="FILE", help="microphone positions (default: the model's)")
-    add("--seed", type=int, default=0, help="of intervals by drawn recordings (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the intervals (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: %(default)s)")
 
 
@@ -322,7 +322,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         **found["channels aligned"],
         "as_recorded": found["as recorded"],
     }
-    lines = [f"{len(lost)} of {len(recordings)} recordings have channels that lost buffers"]
+    lines = [f"{len(lost)} of {len(recordings)} recordings have channels with lost buffers"]
     lines += [line for title, one in found.items() for line in _lines(title, one)]
-    lines += ["", f"listed, not scored: {', '.join(listed)}"]
+    lines += ["", f"listed but not scored: {', '.join(listed)}"]
     return CommandResult(report, table={}, lines=lines)

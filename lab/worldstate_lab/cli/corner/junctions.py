@@ -62,12 +62,12 @@ _PAPER = ("detection", "false_alarms_per_hour")
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("folder", type=Path, metavar="FOLDER", help="recordings of a corner")
-    add("--features", type=Path, required=True, metavar="CSV", help="windows to train the classifiers on")
-    add("--lists", type=Path, nargs="+", required=True, metavar="CSV", help="recordings left out of them")
-    add("--model", type=Path, metavar="FILE", help="for the chain (default: the one that ships)")
-    add("--path", choices=SPECTRA, default=SPECTRA[0], help="how the spectra are read (default: %(default)s)")
-    add("--seed", type=int, default=1, help="of the classifiers and intervals (default: %(default)s)")
+    add("folder", type=Path, metavar="FOLDER", help="recordings of street corners")
+    add("--features", type=Path, required=True, metavar="CSV", help="training windows of the classifiers")
+    add("--lists", type=Path, nargs="+", required=True, metavar="CSV", help="recordings left out of training")
+    add("--model", type=Path, metavar="FILE", help="for the chain (default: the shipped one)")
+    add("--path", choices=SPECTRA, default=SPECTRA[0], help="reading of the spectra (default: %(default)s)")
+    add("--seed", type=int, default=1, help="seed of classifiers and intervals (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 

@@ -63,17 +63,17 @@ _LONGEST_CUT_S = 2.0  # T0 is 7 s in most recordings and 2 s in one: the rest mu
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("folder", type=Path, metavar="FOLDER", help="recordings of a corner")
-    add("--path", choices=get_args(PathName), help="what hears (default: all, pair if its model is there)")
-    add("--boxes", default="boxes", metavar="NAME", help="folder of boxes, none for no camera (%(default)s)")
-    add("--model", type=Path, metavar="FILE", help="of --path (default: the one that ships, pair/model.json)")
+    add("folder", type=Path, metavar="FOLDER", help="recordings of street corners")
+    add("--path", choices=get_args(PathName), help="source of the sound (default: all with a model)")
+    add("--boxes", default="boxes", metavar="NAME", help="folder of boxes; none: no camera (%(default)s)")
+    add("--model", type=Path, metavar="FILE", help="of --path (default: the shipped one or pair/model.json)")
     add("--exam", type=Path, metavar="FILE", help="simulated exam of the pair's model (default: beside it)")
-    add("--features", type=Path, metavar="CSV", help="windows to train the published classifier on")
-    add("--lists", type=Path, nargs="+", default=[], metavar="CSV", help="recordings left out of them")
+    add("--features", type=Path, metavar="CSV", help="training windows of the published classifier")
+    add("--lists", type=Path, nargs="+", default=[], metavar="CSV", help="recordings left out of training")
     add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="of the pair, for the summed rows")
-    add("--windows", action="store_true", help="only what windows are worth by how they enter the filter")
-    add("--start", type=float, default=0.0, metavar="S", help="cut off every start (default: %(default)s)")
-    add("--seed", type=int, default=1, help="of folds and intervals (default: %(default)s)")
+    add("--windows", action="store_true", help="only compare ways to use windows in the filter")
+    add("--start", type=float, default=0.0, metavar="S", help="cut off at the start (default: %(default)s)")
+    add("--seed", type=int, default=1, help="seed of folds and intervals (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
@@ -98,17 +98,17 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if arguments.streams:
         report["sums"] = _sums(arguments, heard, chains[0])
         for path, sums in report["sums"].items():
-            lines += scores_table(sums, f"{path}: sums that are not the product, by sound alone").lines()
+            lines += scores_table(sums, f"{path}: sums that are not shipped, sound alone").lines()
     return CommandResult(plain(report), table={}, lines=lines)
 
 
 def _check(arguments: argparse.Namespace) -> None:
     if bool(arguments.features) != bool(arguments.lists):
-        raise InvalidArgumentError("--features: expected together with --lists, so that none is tested on")
+        raise InvalidArgumentError("--features: expected together with --lists, to exclude test recordings")
     if arguments.model is not None and arguments.path is None:
-        raise InvalidArgumentError("--model: expected --path, which it was made for")
+        raise InvalidArgumentError("--model: expected --path, for which it was made")
     if arguments.streams and (arguments.path is not None or arguments.windows):
-        raise InvalidArgumentError("--streams: expected every path and no --windows, got one")
+        raise InvalidArgumentError("--streams: expected neither --path nor --windows, got one")
 
 
 def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:

@@ -66,10 +66,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("folder", type=Path, metavar="FOLDER", help="recordings: truth.csv, video, boxes, detector")
-    add("--out", type=Path, metavar="DIR", required=True, help="boxes by state, read where they exist")
+    add("--out", type=Path, metavar="DIR", required=True, help="boxes by state; existing files are reused")
     add_choice(parser, "--detector", "", "nanodet", "motion")
     add("--timeline", metavar="ID", help="draw this approach into DIR")
-    add("--seed", type=int, default=0, help="of noise and intervals (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of noise and intervals (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
 
@@ -108,7 +108,7 @@ def _stage(staging: Staging, recordings: Sequence[CornerRecording], jobs: int) -
         ms = milliseconds_a_search(staging, missing[0])
         # Ten images per second; staging adds a fifth.
         minutes = 1.2e-3 * ms * states * 10.0 * missing[0].length_s / staging.every / jobs / 60.0
-        told = f"staging, {ms:.0f} ms a search, {minutes:.0f} minutes"
+        told = f"staging, {ms:.0f} ms per search, {minutes:.0f} minutes"
         list(track(in_processes(partial(stage_recording, staging), missing, jobs), told, len(missing)))
 
 
@@ -118,11 +118,14 @@ def _choice(recordings: Sequence[CornerRecording]) -> tuple[dict[str, Any], list
     columns = "least score", "least height (px)", "found", "hazard-free", "gain"
     shown = [_choice_row(one) for one in tried[:_PRINTED_CHOICES]]
     others: list[tuple[Cell, ...]] = [(junction, *_choice_row(one)) for junction, one in left_out.items()]
-    title = f"Least score and height, the best {len(shown)} of {len(tried)}"
+    title = f"Minimum score and height, the best {len(shown)} of {len(tried)}"
     tables = [
         Table("choice", title, columns, shown),
         Table(
-            "left_out", "Chosen without a junction, and what it accepts there", ("junction", *columns), others
+            "left_out",
+            "Choice without a junction, and its shares there",
+            ("junction", *columns),
+            others,
         ),
     ]
     return {"tried": tried, "left_out": left_out}, tables
@@ -170,7 +173,7 @@ def _beta_tables(curves: BetaCurves) -> list[Table]:
     falls = [(one.along, one.where, Value(one.by, one.low, one.high)) for one in curves.falls]
     return [
         Table("beta", "Miss rate of the reference vehicle after T0", ("state", "all", *curves.bins), rows),
-        Table("falls", "Where it falls and ought to rise", ("along", "where", "by"), falls),
+        Table("falls", "Steps at which it falls although it should rise", ("along", "where", "by"), falls),
     ]
 
 
