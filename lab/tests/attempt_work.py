@@ -15,10 +15,11 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Level and Gram matrix of each second of a sound file; every making of a table adds a line to `log`."""
+    """Level and Gram matrix of each second of a sound file; every computation of a table adds a line to
+    `log`."""
 
-    folder: Path  # Of the cache
-    pause_s: float = 0.0  # As if it took that long
+    folder: Path  # Folder of the cache
+    pause_s: float = 0.0  # Simulated duration
 
     def __call__(self, path):
         mark = fingerprint(path, self.folder / "fingerprints")
@@ -34,13 +35,13 @@ class Levels:
         except soundfile.LibsndfileError as error:
             raise InputFileError(path, "expected a sound file") from error
         seconds = sound[: len(sound) // rate_hz * rate_hz].reshape(-1, rate_hz, sound.shape[1])
-        # Products of this size are shared among BLAS threads where more than one may run.
+        # Products of this size are distributed over BLAS threads if more than one may run.
         gram = np.array([second.T @ second for second in seconds])
         return HopTable({"gram": gram, "level": np.sqrt(np.mean(seconds**2, (1, 2)))}, path.name)
 
 
 def write_sounds(folder, n, seconds=2):
-    """Write so many files of noise."""
+    """Write this many files of noise."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(1)
     paths = [folder / f"{i}.wav" for i in range(n)]
@@ -50,6 +51,6 @@ def write_sounds(folder, n, seconds=2):
 
 
 def end_at_one(item):
-    """End the process in the middle of its work, as the kernel does where the memory is full."""
+    """End the process in the middle of its work, as the kernel does when memory is exhausted."""
     if item == 1:
         os._exit(9)

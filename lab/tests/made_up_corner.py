@@ -1,4 +1,4 @@
-"""A folder in the layout of the real corner, made up: vehicles that come from either side and pass."""
+"""An artificial folder in the layout of the real corners: vehicles come from either side and pass."""
 
 import csv
 import json
@@ -10,23 +10,23 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 
 SECONDS, T0_S, RATE_HZ, FPS, SIZE_PX = 4.0, 3.0, 48_000, 10.0, (1936, 1216)
 JUNCTIONS = ("SA1", "SB1")
-# Before line of sight the sound comes from a wall of the side's arm, as most of it does at the real corner.
+# Before line of sight, the sound comes from a wall of the side's arm, like most of it at the real corners.
 WALL_RAD = np.radians(50.0)
-# The microphones stand 0.68 m apart; a vehicle's sound reaches the farther one so many samples later.
+# The microphones are 0.68 m apart; a vehicle's sound reaches the farther one with this delay in samples.
 SPACING_M, SOUND_M_S = 0.68, 343.0
 COLUMNS = ("id", "junction", "side", "t0_s", "seconds", "entry_exit")
 PARKED = [1500.0, 800.0, 1620.0, 880.0, 0.8, "car"]
 
 
 def write_corner(folder, rng, approaches=2, hazard_free=2):
-    """Write recordings of 4 s with T0 at 3 s, approaches first, from the left and from the right in turn.
+    """Write recordings of 4 s with T0 at 3 s, approaches first, alternately from the left and the right.
 
-    Every second recording is of the other junction, in which a car is parked. Return the folder.
+    Every second recording is from the other junction, which has a parked car. Return the folder.
     """
     sides = [("left", "right")[i % 2] for i in range(approaches)] + ["none"] * hazard_free
     for part in ("sound", "boxes"):
         (folder / part).mkdir(parents=True)
-    # Two after another lie at different junctions: each has approaches and hazard-free recordings.
+    # Consecutive recordings are from different junctions: each has approaches and hazard-free recordings.
     rows = [(f"{i}_{side}", JUNCTIONS[i % 2], side, T0_S, SECONDS, "") for i, side in enumerate(sides)]
     with (folder / "truth.csv").open("w", newline="") as file:
         csv.writer(file).writerows([COLUMNS, *rows])
@@ -39,13 +39,14 @@ def write_corner(folder, rng, approaches=2, hazard_free=2):
 
 
 def loudness(time_s, side):
-    """Return how loud the vehicle is beside the street, which is 1: it doubles each half second up to T0."""
+    """Return the amplitude of the vehicle relative to the street: it doubles each half second up to T0."""
     rise = 4.0 * 2.0 ** (-2.0 * np.maximum(T0_S - time_s, 0.0))
     return rise if side != "none" else np.zeros_like(time_s)
 
 
 def azimuth_rad(time_s, side):
-    """Return where the vehicle's sound comes from, left positive: a wall, from T0 on the vehicle itself."""
+    """Return the direction of the vehicle's sound, left positive: a wall, and from T0 on the vehicle
+    itself."""
     seen = PinholeCamera.ovad().azimuth(_middle_px(time_s, side))
     return np.where(time_s < T0_S, WALL_RAD if side == "left" else -WALL_RAD, seen)
 
@@ -56,7 +57,7 @@ def _middle_px(time_s, side):
 
 
 def _spectra(side, rng):
-    """Return spectra every 0.1 s over 180 azimuths, which count to the right."""
+    """Return spectra every 0.1 s over 180 azimuths, which are positive to the right."""
     time_s, azimuths = np.arange(1, 40) / FPS, np.radians(np.linspace(-90.0, 90.0, 180))
     away = azimuths + azimuth_rad(time_s, side)[:, None]
     peak = 0.06 * loudness(time_s, side)[:, None] * np.exp(-0.5 * (away / 0.1) ** 2)

@@ -1,4 +1,4 @@
-"""Recordings and answers whose figures are known: 0.1-s hops from the first second on."""
+"""Recordings and decisions with known figures: 0.1-s hops from the first second on."""
 
 import numpy as np
 from worldstate_lab.trials.trial import (
@@ -13,7 +13,7 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 
 def made_up(name, label="none", *, t0_s=5.0, hops=81, site="SA1", fingerprint="", in_view_rad=0.3, **about):
-    """One recording, in which a moving box is in view for a second from T0 on."""
+    """Return a recording with a moving box in view for one second from T0 on."""
     time_s = np.round(1.0 + 0.1 * np.arange(hops), 6)
     seen = (time_s > t0_s + 1e-6) & (time_s < t0_s + 1.0 + 1e-6) & (label != "none")
     columns = {
@@ -35,14 +35,14 @@ def made_up(name, label="none", *, t0_s=5.0, hops=81, site="SA1", fingerprint=""
 
 
 def alarmed(trial, spans, **columns):
-    """An answer in alarm from each start to each end, seconds, ends left out."""
+    """Return decisions in alarm from each start to each end, in seconds, without the end."""
     time_s = trial.hops.time_s
     on = [(time_s > start - 1e-6) & (time_s < end - 1e-6) for start, end in spans]
     return Decisions.of(time_s, np.any(on, axis=0) if on else np.zeros(len(time_s), bool), **columns)
 
 
 def random_study(rng, *, approaches=8, calm=7, seeds=1, hops=60):
-    """Recordings at two sites and answers at random, with all columns stated."""
+    """Return recordings at two sites and random decisions, with values in all columns."""
     labels = ["left" if i % 2 else "right" for i in range(approaches)] + ["none"] * calm
     trials = [
         made_up(f"r{i:03d}", label, t0_s=4.0 + 0.1 * (i % 7), hops=hops, site=f"S{i % 3}")
@@ -69,6 +69,6 @@ def random_answer(trial, rng):
 
 
 def tracked(trial, there, names, azimuth_rad):
-    """At most one track a hop."""
+    """Return tracks with at most one per hop."""
     rows = zip(trial.hops.time_s[there], names[there], azimuth_rad[there], strict=True)
     return HopTable.of_rows(TRACK_COLUMNS, rows)

@@ -1,7 +1,7 @@
-"""Clips of passing vehicles for tests of the signature study, made from the simulator's emission models.
+"""Clips of passing vehicles for tests of the signature study, from the simulator's emission models.
 
-Every kind of road user drives past one microphone in an open street, in the ambience of the simulator. What
-differs between the two streets, and what a microphone adds, are assumptions.
+Every kind of road user drives past one microphone in an open street, with the ambience of the simulator. The
+differences between the two streets, and the effects of a microphone, are assumptions.
 """
 
 from collections.abc import Iterator
@@ -22,12 +22,13 @@ from worldstate.simulation.sound.diffraction import air_gain, ground_gain
 from worldstate.simulation.sound.receiver import NEAREST_M, Receiver
 from worldstate.simulation.sound.renderers import add_ambience
 
-# Twice the highest band and some, at half the cost of 48 kHz.
+# Slightly more than twice the highest band, at half the cost of 48 kHz.
 RATE_HZ = 24_000.0
 KNOTS_S = np.arange(CLIP_S * RATE_HZ / KNOT_SAMPLES + 1) * KNOT_SAMPLES / RATE_HZ
-HEAD_BLOCKS = 57  # Emission begins .3 s earlier, longer than sound needs from where the fastest vehicle is
+# Emission begins 0.3 s earlier, longer than the sound's travel time from the fastest vehicle
+HEAD_BLOCKS = 57
 MICROPHONE_HEIGHT_M = 1.5
-# The corpora's words for the simulator's kinds.
+# The corpora's names of the simulator's kinds.
 WORDS = {
     "light": "car",
     "medium": "truck",
@@ -37,52 +38,54 @@ WORDS = {
     "tram": "tram",
 }
 SLOW_KMH = {"bicycle": (12.0, 25.0), "tram": (15.0, 40.0)}
-BACKGROUNDS = 3  # Clips without a vehicle in a recording: as many as of cars and trucks
-# Assumed: CNOSSOS states the mean of a category and not how single vehicles scatter about it.
+BACKGROUNDS = 3  # Clips without a vehicle per recording: as many as of cars and trucks
+# Assumed: CNOSSOS gives the mean of a category but not the variation of single vehicles.
 VEHICLE_SPREAD_DB = 3.0
 FAR_LEVEL_DB = (
-    8.0  # of a distant vehicle against the ambience: these streets are busier than a blind junction
+    8.0  # of a distant vehicle relative to the ambience: these streets are busier than a blind junction
 )
-# Assumed, per octave: backgrounds differ from day to day by birds, leaves, building sites, the far road.
+# Assumed, per octave: backgrounds vary from day to day with birds, leaves, building sites and distant roads.
 COLOUR_SPREAD_DB = 3.0
 JITTER_S = 0.2  # Clips are centred by hand
 
 
 @dataclass(frozen=True, slots=True)
 class MicrophoneGrade:
-    """What a recorder makes of the pressure before it."""
+    """Response and noise of a recorder."""
 
     name: str
-    # White up to 12 kHz, dB re 20 uPa; A-weighted it is .5 dB less, so the data sheet's dB(A) are taken.
+    # White up to 12 kHz, dB re 20 uPa; its A-weighted level is 0.5 dB lower, so the data sheet's dB(A) are
+    # used.
     self_noise_db: float
     low_cut_hz: float
-    gain_db: float = 0.0  # Against full scale at `FULL_SCALE_PA`
-    gain_spread_db: float = 0.0  # Of the gain between recordings
+    gain_db: float = 0.0  # Relative to full scale at `FULL_SCALE_PA`
+    gain_spread_db: float = 0.0  # Standard deviation of the gain between recordings
 
 
 # sE8: 13 dB(A). ICS-43434: 65 dB(A) below 94 dB SPL, -3 dB at 60 Hz.
 STUDIO = MicrophoneGrade("studio", 13.0, 20.0)
 MEMS = MicrophoneGrade("mems", 29.0, 60.0)
-# No data sheet: a MEMS capsule behind the high-pass and the automatic gain of a phone.
+# No data sheet: a MEMS capsule with the high-pass and the automatic gain of a phone.
 PHONE = MicrophoneGrade("phone", 36.0, 120.0, gain_db=14.0, gain_spread_db=4.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Roadside:
-    """Where recordings are made."""
+    """Location of recordings."""
 
     name: str
     microphones: tuple[MicrophoneGrade, ...]
-    ambient_db: float  # Against the simulator's street
-    far_rate: float  # Distant vehicles in ten seconds
+    ambient_db: float  # Relative to the simulator's street
+    far_rate: float  # Distant vehicles per ten seconds
     speed_kmh: tuple[float, float]
-    distance_m: tuple[float, float]  # Of the lanes from the microphone
-    kinds: tuple[str, ...]  # Of the vehicles that pass in every recording
-    windshield_db: float = 0.0  # What it takes from the simulator's wind
+    distance_m: tuple[float, float]  # Distance of the lanes from the microphone
+    kinds: tuple[str, ...]  # Kinds of vehicles that pass in every recording
+    windshield_db: float = 0.0  # Its reduction of the simulator's wind
     official_split: bool = False  # Every second recording is for training
 
 
-# Roads of 30 to 70 km/h at the edge of a small town, and streets of several lanes and trams in a large one.
+# Roads of 30 to 70 km/h at the edge of a small town, and streets with several lanes and trams in a large
+# city.
 TOWN_ROAD = Roadside(
     name="SIMULATED roads",
     microphones=(STUDIO, MEMS),
@@ -90,7 +93,7 @@ TOWN_ROAD = Roadside(
     far_rate=0.6,
     speed_kmh=(30.0, 70.0),
     distance_m=(4.0, 10.0),
-    kinds=("light", "medium", "heavy"),  # IDMT-Traffic has no quiet road users either
+    kinds=("light", "medium", "heavy"),  # Like IDMT-Traffic, without quiet road users
     windshield_db=10.0,
     official_split=True,
 )
@@ -108,7 +111,8 @@ CITY_STREET = Roadside(
 def simulated_recording(
     street: Roadside, number: int, rng: np.random.Generator
 ) -> Iterator[tuple[ClipLabels, Float32Array]]:
-    """Yield the clips of one recording, samples (n, 1) at `RATE_HZ`; every microphone hears the same."""
+    """Yield the clips of one recording, samples (n, 1) at `RATE_HZ`; every microphone records the same
+    sound."""
     levels = _levels(street, rng)
     gains_db = [one.gain_db + one.gain_spread_db * rng.standard_normal() for one in street.microphones]
     split = ("train", "test")[number % 2] if street.official_split else ""
@@ -127,12 +131,13 @@ def _levels(street: Roadside, rng: np.random.Generator) -> Preset:
     usual = preset()
     drawn_db = street.ambient_db + COLOUR_SPREAD_DB * rng.standard_normal(8)
     octaves = np.array(usual.ambient_octaves_db) + drawn_db
-    # Direction is lost on one microphone: the fewest waves will do. Its own noise is added by its grade.
+    # One microphone records no direction, so the minimum number of waves suffices. Its own noise is added by
+    # its grade.
     return replace(
         usual,
         ambient_octaves_db=tuple(octaves.tolist()),
         ambient_waves=8,
-        site_ambient_db=0.0,  # a street of this study has a level of its own
+        site_ambient_db=0.0,  # a street of this study has its own level
         site_wind_db=0.0,
         far_rate=street.far_rate,
         far_level_db=FAR_LEVEL_DB,
@@ -150,7 +155,7 @@ def _ambience(levels: Preset, rng: np.random.Generator) -> Float32Array:
 
 
 def _passage(street: Roadside, kind: str, rng: np.random.Generator) -> Float32Array:
-    """Draw the pressure of one vehicle that is abreast in the middle of the clip, Pa, shape (n,)."""
+    """Draw the pressure of one vehicle that passes at the middle of the clip, Pa, shape (n,)."""
     knots = np.arange(-HEAD_BLOCKS, len(KNOTS_S)) * KNOT_SAMPLES / RATE_HZ
     what, side = vehicle_kind(kind), rng.choice((-1.0, 1.0))
     path = drive(
@@ -163,8 +168,8 @@ def _passage(street: Roadside, kind: str, rng: np.random.Generator) -> Float32Ar
     )
     samples = (len(knots) - 1) * KNOT_SAMPLES
     parts = emit(path, samples, RATE_HZ, VEHICLE_SPREAD_DB * rng.standard_normal(), rng)
-    # Axles and engine each by themselves: one source in the middle, at the height of an engine, is 4 dB too
-    # quiet between .7 and 2 kHz, where the road's reflection cancels what comes from that height.
+    # Axles and engine are separate sources: a single source at the height of an engine is 4 dB too quiet
+    # between 0.7 and 2 kHz, where the road's reflection cancels its sound.
     out = np.zeros((len(KNOTS_S) - 1) * KNOT_SAMPLES, np.float32)
     for part in parts:
         _add_heard(out, part, knots, np.hypot(*path.behind(part.behind_m)))
@@ -172,7 +177,7 @@ def _passage(street: Roadside, kind: str, rng: np.random.Generator) -> Float32Ar
 
 
 def _add_heard(out: Float32Array, part: SourceSignal, knots_s: FloatArray, ground_m: FloatArray) -> None:
-    """Carry a signal over a changing distance: air, the road's reflection, delay and spreading."""
+    """Propagate a signal over a changing distance: air, the road's reflection, delay and spreading."""
     length = np.hypot(ground_m, MICROPHONE_HEIGHT_M - part.height_m)
     gain = air_gain(length) * ground_gain(length, part.height_m, MICROPHONE_HEIGHT_M)
     made = Emission.of(part.signal, knots_s[0], RATE_HZ).table(gain)
@@ -186,7 +191,7 @@ def _add_heard(out: Float32Array, part: SourceSignal, knots_s: FloatArray, groun
 def _recorded(
     pressure: Float32Array, grade: MicrophoneGrade, gain_db: float, rng: np.random.Generator
 ) -> Float32Array:
-    """Return what a microphone makes of a pressure, full scale 1, shape (n, 1)."""
+    """Return the recording of a pressure by a microphone, full scale 1, shape (n, 1)."""
     from scipy.signal import butter, sosfilt
 
     noise = REFERENCE_PA * 10.0 ** (grade.self_noise_db / 20.0) * rng.standard_normal(len(pressure))

@@ -1,4 +1,4 @@
-"""Every ablation is a switch of one evaluation; each removes what it says and nothing else."""
+"""Every ablation is a switch of one evaluation and removes only its own part."""
 
 import math
 
@@ -24,10 +24,10 @@ BETA = {0.0: 0.05, 0.5: 0.5, 1.0: 0.97}
 
 
 def recording(rng, number, label, d=0.0):
-    """Heard for 3 s before T0, seen after it by a camera that misses more as d grows.
+    """Return a recording audible for 3 s before T0 and then seen by a camera that misses more as d grows.
 
-    The signature drifts towards visible once the vehicle is in sight; looming is noise about 1 while it
-    approaches and about 0 otherwise.
+    The signature drifts towards visible once the vehicle is in sight. Looming is noise with mean 1 while it
+    approaches, and with mean 0 otherwise.
     """
     hops = 141
     stream = blank_stream(f"{label}/{number}", hops)

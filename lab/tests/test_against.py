@@ -1,4 +1,4 @@
-"""Two evaluations compared from what they left on disk."""
+"""Comparison of two evaluations from their saved scores."""
 
 import json
 from dataclasses import replace
@@ -35,7 +35,7 @@ def test_a_file_gives_the_figures_and_draws_of_the_run(tmp_path, silent):
         score = Score.of(trials, [[alarmed(one, []) for one in trials]])
     ((key, saved),) = load_scores(evaluated(tmp_path / "a", score)).items()
     draws = stratified_draws(score.draw_strata, np.random.default_rng(0), 30)
-    # To the last bit: nothing is rounded on the way.
+    # To the last bit: nothing is rounded when saved.
     assert_equal(saved.draws(draws), score.draws(draws))
     assert_equal(saved.intervals(draws), score.intervals(draws))
     assert saved.recordings == score.recordings
@@ -45,7 +45,7 @@ def test_a_file_gives_the_figures_and_draws_of_the_run(tmp_path, silent):
 def test_a_comparison_is_the_paired_one_on_the_shared_recordings(tmp_path):
     trials, passes, ours = study(2)
     _, others, _ = study(3)
-    # The other evaluation lacks two recordings, has another in place of one, and another order.
+    # The other evaluation lacks two recordings, has one replaced, and has another order.
     changed = trials[4].hops.about | {"fingerprint": "other"}
     heard = [
         *trials[:4],
@@ -73,7 +73,7 @@ def test_a_better_method_shows_and_an_equal_one_does_not(tmp_path):
     trials = [made_up(f"r{i:02d}", "left" if i < 20 else "none") for i in range(40)]
 
     def detecting(hits):
-        """Two seconds before T0 in the first recordings."""
+        """Return decisions with an alarm two seconds before T0 in the first recordings."""
         return Score.of(
             trials, [[alarmed(one, [(3.0, 4.0)] if i < hits else []) for i, one in enumerate(trials)]]
         )
@@ -125,7 +125,7 @@ def test_folders_and_files_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(InputFileError, match="expected a finished evaluation"):
         load_scores(tmp_path)
     folder = evaluated(tmp_path / "a", score)
-    # A second evaluation leaves nothing of the first.
+    # A second evaluation removes the scores of the first.
     evaluated(folder, score, key=("dynamic", "rule"))
     assert list(load_scores(folder)) == [("dynamic", "rule")]
     path = folder / "scores.npz"

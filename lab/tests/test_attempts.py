@@ -1,4 +1,4 @@
-"""One evaluation on one process or on several: the same tables, whatever happens meanwhile."""
+"""One evaluation on one or several processes: the same tables, even after interruptions."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ from worldstate.ground.errors import WorldstateError
 
 
 def plain(outcome):
-    """What an outcome holds, bit for bit."""
+    """Return the content of an outcome, bit for bit."""
     if isinstance(outcome, Failed):
         return outcome
     return outcome.name, {name: column.tobytes() for name, column in outcome.columns.items()}
@@ -29,7 +29,7 @@ def test_any_number_of_processes_gives_the_same_and_reports_the_broken_recording
     paths[4].unlink()
     found = {}
     for name, jobs in (("one", 1), ("two", 2)):
-        # A cache of its own: nothing is taken over from the engine before.
+        # A separate cache, so that no result of the previous run is reused.
         work = Levels(tmp_path / name / "cache")
         work.folder.mkdir(parents=True)
         found[name] = [plain(one) for one in attempted(work, paths, jobs, name=lambda path: path.stem)]
@@ -82,7 +82,7 @@ def start(folder, pause_s):
     )
 
 
-# The two that ask are slow: `tests/cli/test_faults.py` sends them to a command with the same processes.
+# Two signals are slow: `tests/cli/test_faults.py` sends them to a command with the same processes.
 ASKED = [pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGTERM)]
 
 
@@ -96,7 +96,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same(number, 
         run.stdout.readline()
     asked = time.monotonic()
     os.killpg(run.pid, number) if number == signal.SIGINT else run.send_signal(number)
-    # The pipe closes when the last process of the run is gone, its workers among them.
+    # The pipe closes when the last process of the run, workers included, has ended.
     run.communicate(timeout=20.0)
     assert run.returncode != 0
     assert time.monotonic() - asked < 10.0
@@ -131,9 +131,9 @@ def test_memory_does_not_grow_with_the_number_of_recordings(tmp_path):
         finally:
             tracemalloc.stop()
 
-    peak(1)  # What is imported and cached once does not count
+    peak(1)  # One-time imports and caches are excluded
     (few, small), (many, large) = peak(2), peak(24)
     assert (few, many) == (2, 24)
-    # The samples of 22 more recordings would take 45 MB; their tables take 5 kB each.
+    # The samples of 22 more recordings would need 45 MB; their tables need 5 kB each.
     assert small > 2 << 20
     assert large - small < 1 << 20

@@ -23,7 +23,7 @@ def box(middle_px, width_px=200.0):
 
 
 def vehicle(frames, first_px=1700.0, step_px=-25.0, moving=True, rate_hz=10.0):
-    """Boxes of one vehicle that crosses the image evenly, in the images `frames`."""
+    """Return boxes of one vehicle that crosses the image at constant speed, in the images `frames`."""
     frames = np.asarray(frames)
     count = len(frames)
     return HopTable(
@@ -53,7 +53,7 @@ def alarmed_s(decisions):
 
 
 def street(rng, vehicles=10, images=60):
-    """Boxes and scores of a dense crowd that stops and starts, vanishes for a second at a time, is missed."""
+    """Return boxes and scores of a dense crowd that stops, starts, vanishes for seconds, and is missed."""
     middle, velocity = rng.uniform([0, 400], [900, 500], (vehicles, 2)), np.zeros((vehicles, 2))
     half = 0.5 * rng.uniform(80, 200, (vehicles, 2))
     for image in range(images):
@@ -71,9 +71,9 @@ def in_order(boxes_px):
 
 
 def agree(images):
-    """Hold our tracks against those of the `trackers` package, image by image; return how many were named."""
+    """Compare our tracks with those of the `trackers` package, image by image; return their number."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Its own deprecations
+        warnings.simplefilter("ignore")  # Deprecations in that package
         peer = pytest.importorskip("trackers").OCSORTTracker()
         from supervision import Detections
     ours, theirs, counted = OcSort(), {}, 0
@@ -85,8 +85,9 @@ def agree(images):
         lost = [track.get_state_bbox() for track in peer.tracks if track.time_since_update]
         assert len(tracks) == len(peer.tracks) and len(coasting) == len(lost)
         np.testing.assert_allclose(in_order(coasting), in_order(lost), atol=1e-6)
-        # It numbers a track when it is certain, we do when it begins: numbers are compared through the boxes.
-        # It begins to count images at the first box and exempts one more than the authors' code from waiting.
+        # It numbers a track when it is confirmed, we do when it starts, so identities are compared through
+        # the boxes. It counts images from the first box and returns unconfirmed tracks in one image more than
+        # the authors' code.
         boxes = found.data.get("at", np.empty(0, int))
         named = {
             int(at): int(number) for at, number in zip(boxes, found.tracker_id, strict=True) if number >= 0
@@ -114,7 +115,7 @@ def test_it_agrees_on_the_boxes_of_a_recording(approach):
 @few
 @given(st.integers(15, 60), st.integers(1, 25))
 def test_a_tracker_coasts_after_it_has_seen_a_vehicle(first, hidden):
-    """Seen for 8 images, behind a lorry for some, then seen again: only `coasting` speaks between."""
+    """Seen for 8 images, hidden by a lorry, then seen again: only `coasting` is in alarm while hidden."""
     frames = np.r_[first : first + 8, first + 8 + hidden : first + 12 + hidden]
     before = vehicle(frames[:8], step_px=-10.0)
     of = trial(t0_s=np.nan, hops=130, boxes=vehicle(frames, step_px=-10.0))
@@ -124,7 +125,7 @@ def test_a_tracker_coasts_after_it_has_seen_a_vehicle(first, hidden):
     assert not stock.alarm[between].any() and coasting.alarm[between].all()
     assert (coasting.side[between] == np.sign(coasting.bearing_rad[between])).all()
     assert len(set(coasting.tracks.track)) == 1
-    # 30 images after the last box the track ends, and with it the advisory.
+    # The track ends 30 images after the last box, and the advisory with it.
     assert alarmed_s(coasting)[-1] == pytest.approx(frames[-1] / 10 + 3.0, abs=0.05)
 
 
@@ -153,7 +154,7 @@ def test_vision_names_the_side_of_the_widest_box():
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 def test_a_parked_car_is_no_hazard(row):
-    """Before a second has passed nobody can tell that it stands: no track of that second may coast on."""
+    """In the first second a parked car cannot be recognised: a track of that second must not coast."""
     stands = vehicle(np.arange(100), step_px=0.0, moving=np.arange(100) < 10)
     assert not said(row, trial(boxes=stands)).alarm.any()
     assert seen_early_s([trial(boxes=stands)]) == 0.0
@@ -185,7 +186,7 @@ def truth(azimuth_rad, in_view, frames=100):
 def test_radar_waves_do_not_turn_corners(azimuth_rad, entry):
     of = trial(truth=truth(azimuth_rad, np.arange(100) >= entry))
     decisions = said(RadarFieldOfView(detection=1.0), of)
-    # The last hop would need the scan of an image that was not taken any more.
+    # The last hop would need the scan of an image after the end of the recording.
     assert alarmed_s(decisions) == of.hops.time_s[entry - 10 : -1].round(1).tolist()
     assert (decisions.side[decisions.alarm] == np.sign(azimuth_rad)).all()
 

@@ -1,4 +1,4 @@
-"""Bearings beside their stated deviations: what is counted, and a source whose place is known."""
+"""Bearings and their standard deviations: counts, and a source with a known position."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_hops_without_a_stated_bearing_are_the_least_sure_ones() -> None:
 
 
 def test_a_source_in_the_open_is_found_where_it_stands_by_the_front_end_and_by_peers() -> None:
-    # Of the seeds the first in the open.
+    # The first seed with a scene in the open.
     number = next(n for n in range(20) if not drawn_scene(np.random.default_rng((1, n))).indoors)
     indoors, bearings = scene_bearings(number, 1)
     assert not indoors

@@ -1,4 +1,4 @@
-"""The benchmark prints what it promises; how fast is for people to read, not for tests to assert."""
+"""The benchmark prints all its rows; its speed is not tested."""
 
 import json
 
@@ -28,7 +28,7 @@ def test_the_files_of_a_hop_are_those_that_it_executes(capsys):
     assert main(["bench", "--files", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["n_files"] == len(report["files"])
-    # 5,553 in version 0.3: calls, not arithmetic, are most of what a hop costs.
+    # 5,553 in version 0.3: most of the time of a hop is calls and not arithmetic.
     assert 1000 < report["n_calls"] < 4000
     assert {"worldstate/adapters/listener.py", "worldstate/core/filter.py"} < {*report["files"]}
     assert "worldstate/adapters/source.py" not in report["files"]
@@ -70,7 +70,7 @@ def test_text_names_kernel_threads_and_what_is_compared():
 
 
 def test_everything_that_is_timed_is_there():
-    """The bench's sound makes every stage do its work: a source, a line, a level."""
+    """The bench's sound exercises every stage: it has a source, a spectral line and a level."""
     sound = np.tile(_source(np.random.default_rng(0)), (2, 1))[: RATE_HZ * 5 // 2]
     sound += np.random.default_rng(1).standard_normal(sound.shape, dtype=np.float32)
     frame = FrontEnd(roof_array_56(), RATE_HZ, EVERYTHING).process(sound)[-1]
@@ -83,7 +83,7 @@ def test_everything_that_is_timed_is_there():
 
 def test_the_evidence_that_is_timed_is_read_from_whole_trees_and_a_guard_that_looks_closely():
     rng = np.random.default_rng(0)
-    # As in a street, the microphones share most of the sound.
+    # As in a street, most of the sound is common to the microphones.
     hops = [
         rng.standard_normal((4800, 1), dtype=np.float32)
         + 0.5 * rng.standard_normal((4800, 56), dtype=np.float32)

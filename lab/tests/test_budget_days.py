@@ -1,4 +1,4 @@
-"""Days drawn from streams against the watch over the budget: what is kept, what is found, and how soon."""
+"""Simulated days for the watch over the budget: kept budgets, broken ones, and the time to detection."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from worldstate.core.budget_watch import onset_factors
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.state.cue import Tally
 
-HOPS = 36_000  # An hour
+HOPS = 36_000  # One hour
 BUDGET = 25.0
 
 
 @dataclass(frozen=True)
 class MadeUp:
-    """What the days are drawn from, of a stream and of what was believed of it at once."""
+    """The fields of a stream and of its beliefs from which days are drawn."""
 
     tallies: tuple[Tally, ...]
     within: np.ndarray
@@ -28,7 +28,7 @@ class MadeUp:
 
 
 def street(per_hour: float, seed: int, chance: float = 0.05, true: float = 0.05) -> MadeUp:
-    """Return an hour with onsets at random, and chances of two seconds of which a share comes true."""
+    """Return an hour with random onsets, and chances for two seconds of which a share comes true."""
     rng = np.random.default_rng(seed)
     false = np.cumsum(rng.random(HOPS) < per_hour / HOPS).tolist()
     tallies = tuple(Tally(quiet_ns=100_000_000 * k, false_onsets=n) for k, n in enumerate(false, 1))

@@ -1,4 +1,4 @@
-"""Ablations of a folder of the real corner, on a made-up one."""
+"""Ablations on an artificial folder in the layout of the real corners."""
 
 import json
 
@@ -12,7 +12,7 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 
 def hops(name, label, t0_s, *, advised, present, seen):
-    """Return 20 hops from 1.0 s on with a state that does not change."""
+    """Return 20 hops from 1.0 s on with a constant state."""
     time_s = 1.0 + 0.1 * np.arange(20)
     columns = {
         "time_s": time_s,

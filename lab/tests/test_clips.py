@@ -34,7 +34,7 @@ def test_files_of_several_rates_and_lengths_are_heard(
         rows.append((f"{number}.wav", "noise", f"r{number}", "car" if number == 1 else ""))
     path = table(tmp_path, rows)
     clips = read_clips(path, None)
-    # The shortest is led in by its mirror image: every hop has numbers.
+    # The shortest is extended at its start by its mirror image, so that every hop has numbers.
     assert np.bincount(clips.clip).tolist() == [10, 20, 11]
     np.savez(tmp_path / "heard.npz", character=clips.measures, clip=clips.clip)
     assert main(["clips", str(path), "--json"]) == 0
@@ -59,7 +59,7 @@ def test_a_file_of_numbers_that_are_none_is_refused(
 
 
 def test_probabilities_are_corrected_to_the_shares_of_the_table() -> None:
-    """Two kinds that nothing tells apart: the log-loss is that of the table's own shares, in closed form."""
+    """For two inseparable kinds the log-loss is that of the table's own shares, in closed form."""
     shipped = read_model()
     assert shipped.guard is not None
     inputs = 49

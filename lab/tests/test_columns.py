@@ -31,7 +31,8 @@ def columns(seed, hops=91):
 
 
 def junction(name, offset, rng, number=40):
-    """Excerpts in which every column is normal noise about an offset, approaches and quiet ones in turn."""
+    """Return excerpts whose columns are normal noise around an offset, alternately approaches and quiet
+    ones."""
     found = []
     for i in range(number):
         rows = offset + rng.normal(size=(1, len(COMPARED)))
@@ -67,7 +68,7 @@ def test_a_gain_changes_no_statistic(seed, nats, side):
 
 
 def test_statistics_are_those_of_the_hop_they_name():
-    """A ramp in every column: its value at T0 - t, its change, and none in what the guard refused."""
+    """A ramp in every column: its value at T0 - t, its change, and none in rejected hops."""
     rows = np.tile(TIME_S[:, None], len(COLUMNS))
     rows[(TIME_S > 4.95) & (TIME_S < 5.05)] = np.nan
     found = Excerpt.of("J", "left", T0_S, TIME_S, rows).statistics
@@ -101,7 +102,7 @@ def test_the_squared_distance_is_half_of_scipys_and_zero_for_two_draws_of_one_st
 
 
 def two_sets(rng, offset):
-    """Two real junctions of one street, and a simulated one so far off."""
+    """Return two real junctions of one street, and a simulated one at a distance."""
     real = [*junction("SA1", 0.0, rng), *junction("SB1", 0.0, rng)]
     return real, junction("SA1", offset, rng)
 
@@ -110,7 +111,7 @@ def test_a_stream_is_cut_where_one_vehicle_comes_alone():
     vehicles = (("left", 20.0), ("right", 35.0), ("left", 39.0), ("right", 60.0))
     heard = stream(vehicles, 0)
     found = stream_excerpts(heard, columns(0, len(heard.hops)))
-    assert [one.hazard for one in found] == [True, True, True]  # Not the one that follows by four seconds
+    assert [one.hazard for one in found] == [True, True, True]  # Not the one that follows after four seconds
     assert len(stream_excerpts(heard, columns(0, len(heard.hops)))[0].statistics["5 s before T0"]) == 1
     quiet = stream((), 1)
     assert len(stream_excerpts(quiet, columns(1, len(quiet.hops)))) == int(quiet.hops.time_s[-1] / LENGTH_S)

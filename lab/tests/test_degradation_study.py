@@ -75,7 +75,7 @@ STAGED = (Condition(CLEAN), Condition("noise", 1), Condition("noise", 4), Condit
 
 
 def render(log):
-    """A textured street with the reference boxes drawn as textured cars."""
+    """Return a textured street with the reference boxes drawn as textured cars."""
     rng = np.random.default_rng(0)
     scene = 110.0 + 25.0 * gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), 1.2) / 0.2
     body = 200.0 + 60.0 * gaussian_filter(rng.normal(size=(HEIGHT, WIDTH)), 3.0) / 0.1
@@ -91,7 +91,7 @@ def render(log):
 @pytest.mark.parametrize("reduced", [3.025, 4.0])
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_reduced_frame_comes_out_as_if_reduced_afterwards(family, reduced):
-    """Mean and spread of patches, dark and bright ones, in which clipping moves both."""
+    """Mean and spread of dark and bright patches, in which clipping changes both."""
     grey, rng = next(street(1)), np.random.default_rng(2)
     height, width = grey.shape[:2]
     size = (round(width / reduced), round(height / reduced))
@@ -167,7 +167,7 @@ def test_d_is_read_from_the_images_alone(looks, rates):
 
 
 def part(video, first, last):
-    """Some frames of a video as one of their own."""
+    """Return some frames of a video as a separate video."""
     return SimpleNamespace(
         frames=lambda: islice(video.frames(), first, last), frame_rate_hz=video.frame_rate_hz
     )
@@ -190,14 +190,14 @@ def test_the_scale_of_d_is_that_of_the_same_images(video):
 
 @pytest.mark.long
 def test_counts_are_those_of_measure_absence(approach, video):
-    """On clean frames, where nothing is drawn at random."""
+    """On clean frames, which have no random degradation."""
     whole, (first, last) = read_detections(approach.detections_path), (60, 100)
     reference = DetectionLog(whole.frames[first:last], whole.stamps_ns[first:last])
     small = np.array([WIDTH / WHOLE.width_px, HEIGHT / WHOLE.height_px] * 2)
     frames = [DetectionFrame(one.boxes_px * small, one.scores, one.labels) for one in reference.frames]
     camera = PinholeCamera.ovad(width_px=WIDTH, height_px=HEIGHT)
     scene = LabelledVideo(part(video, first, last), replace(reference, frames=tuple(frames)), camera)
-    # The height below which a reference box does not count is one in the pixels of the video.
+    # The minimum height of a reference box is converted to pixels of the video.
     keep = replace(AbsenceSettings().keep, min_height_px=40.0 * HEIGHT / WHOLE.height_px)
     settings = AbsenceSettings(families=("blur",), keep=keep)
     measured = measure_absence([scene], MotionDetector, np.random.default_rng(0), settings).families["blur"]
@@ -240,7 +240,7 @@ def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, looks, 
 
 
 def assert_the_sound_says_the_same(source, off):
-    """Against the filter itself, on the sound as it was measured and with no camera."""
+    """Compare with the filter itself, on the measured sound and without a camera."""
     world, presence, said = WorldFilter(context=source.context, policy=source.policy), [], []
     for _, measurement in measure_steps(replace(source, detections=None)):
         world = world.predict_to(measurement.stamp_ns).update(measurement)
@@ -292,7 +292,7 @@ def test_a_degraded_camera_misses_what_its_table_says_and_never_less():
     assert left[0.0].all()
     azimuth = WHOLE.sighting(box.boxes_px[0], "car", 0.9).azimuth_rad
     for d in (0.5, 1.0):
-        # Of what a clean camera reports; four standard errors of 2000 draws.
+        # Share of the boxes of a clean camera; four standard errors of 2000 draws.
         expected = (1.0 - table(azimuth, d)) / (1.0 - table(azimuth))
         assert left[d].mean() == pytest.approx(expected, abs=4 * (expected / 2000) ** 0.5)
     assert not (left[1.0] > left[0.5]).any()
@@ -313,7 +313,7 @@ def test_advisories_of_a_state_stand_beside_those_of_the_clean_camera():
     by_name = {row.name: row for row in sweep.rows}
     assert sweep.hours == pytest.approx(0.5)
     assert by_name[CLEAN].onsets == 30 and by_name[CLEAN].per_hour.value == pytest.approx(60.0)
-    # An onset a minute against two, in every minute: no draw of minutes changes that.
+    # One onset per minute against two, in every minute: no draw of minutes changes the ratio.
     assert by_name["lens 1"].ratio == pytest.approx((2.0, 2.0, 2.0))
     assert by_name["off"].onsets == 0 and by_name["off"].upper_90 == pytest.approx(np.log(10.0) / 0.5)
     assert any(
@@ -333,7 +333,7 @@ def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
     ]
     assert any(chain)
     assert found.advised[found.condition == CLEAN].tolist() == chain
-    # Drops on every microphone drown the vehicle.
+    # Noise on every microphone masks the vehicle.
     assert found.advised[found.condition == "roof 1"].sum() < sum(chain)
 
 
@@ -352,7 +352,7 @@ def test_rain_on_the_roof_is_white_and_its_own_at_every_microphone(approach):
 
 
 def readings():
-    """Qualities of images that get blurred and noisy as staged."""
+    """Return qualities of images with the staged blur and noise."""
     rows = [(CLEAN, 0.0, 100.0, 2.0, 5.0)]
     rows += [(Condition("blur", i).name, 0.0, 100.0, 2.0, 5.0 / (1 + i)) for i in range(1, 5)]
     rows += [(Condition("noise", i).name, 0.0, 100.0, 2.0 + 20.0 * i, np.nan) for i in range(1, 5)]
@@ -360,7 +360,7 @@ def readings():
 
 
 def believed(number, approach):
-    """Beliefs in which the sound is right, and the camera too until it is staged."""
+    """Return beliefs from correct sound, and from a camera that is correct until it is degraded."""
     rng, n = np.random.default_rng(number), 40
     time_s = 1.0 + 0.1 * np.arange(n)
     there = approach & (time_s > 3.0)
@@ -379,7 +379,7 @@ def believed(number, approach):
 
 
 def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):
-    """Every recording has looks of a bit of its own, so that the sum tells whose are in it."""
+    """Each recording has a power of two as number of looks, so that the sum shows which ones it contains."""
     recordings = []
     for i in range(8):
         folder = tmp_path / f"r{i}"
@@ -417,7 +417,7 @@ def test_settings_that_cannot_be_are_refused():
 
 @pytest.mark.slow
 def test_the_study_end_to_end_again_from_what_it_kept_and_without_a_broken_recording(tmp_path):
-    """Three approaches and two empty streets, short; the second run opens no video."""
+    """Three short approaches and two short empty streets; the second run opens no video."""
     root = tmp_path / "sim"
     assert main(["simulate", "--out", str(root), "--static", "5", "--duration", "3", "--video"]) == 0
     recordings, keep = list(OvadDataset(root).recordings), PassCache(tmp_path / "kept").tables

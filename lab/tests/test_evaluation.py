@@ -1,4 +1,4 @@
-"""Protocols and rows of the evaluation: known answers, and nothing learned where it is scored."""
+"""Protocols and methods of the evaluation: known results, and no training on test recordings."""
 
 import re
 from collections.abc import Sequence
@@ -55,7 +55,7 @@ PUBLISHED, SUSTAINED = PublishedRule("published"), PublishedRule("sustained", su
 
 
 def told(trial: Trial, hazard: np.ndarray) -> Trial:
-    """A trial of which the published classifier says these probabilities of a vehicle on the left."""
+    """Return a trial with these probabilities of a vehicle on the left from the published classifier."""
     rest = np.full_like(hazard, 1e-9)
     said = np.log(np.stack([hazard, rest, rest, 1.0 - hazard], axis=1))
     about = {**trial.hops.about, "prior": {"published": [0.25] * 4}}
@@ -63,7 +63,7 @@ def told(trial: Trial, hazard: np.ndarray) -> Trial:
 
 
 def calm(number: int, rng: np.random.Generator, *, false_alarms: tuple[int, ...] = ()) -> Trial:
-    """A hazard-free recording, its single loud windows where told."""
+    """Return a hazard-free recording with loud windows at the given hops."""
     hazard = rng.uniform(0.05, 0.3, HOPS)
     hazard[list(false_alarms)] = 0.9
     trial = made_up(f"calm{number:02d}", hops=HOPS, site=f"SA{number % 2}", moving=False)
@@ -81,7 +81,7 @@ def calm(number: int, rng: np.random.Generator, *, false_alarms: tuple[int, ...]
 
 
 def approach(number: int, rng: np.random.Generator, *, lead_s: float) -> Trial:
-    """Heard from `lead_s` before T0 on, in view after it, the slope as for constant speed."""
+    """Return an approach audible from `lead_s` before T0 and in view after it, with constant speed."""
     base = calm(number, rng)
     time_s = base.hops.time_s
     late, seen = time_s >= T0_S - lead_s - 1e-6, time_s > T0_S + 1e-6
@@ -110,7 +110,7 @@ def streets() -> list[Trial]:
 
 
 def asked(method, trials: Sequence[Trial], seed: int = 0) -> list[Decisions]:
-    """What a method says of every trial when it is fitted to the other folds."""
+    """Return the decisions of a method on every trial, fitted to the other folds."""
     rng, said = np.random.default_rng(seed), {}
     for calibration, tested in STATIC.parts(trials, rng):
         decide = method.fit([trials[i] for i in calibration], rng)
@@ -127,7 +127,7 @@ def test_rules_on_posteriors_with_a_known_answer(streets):
     assert at_once["detection"] == held["detection"] == 1.0
     assert at_once["lead_s"] == pytest.approx(2.0)
     assert at_once["false_alarms_per_hour"] == pytest.approx(10 / (10 * HOPS * 0.1 / 3600.0))
-    # Single windows do not last, so every k serves and the smallest is taken; it costs one hop of lead.
+    # Single windows do not last, so every k works and the smallest is chosen; it costs one hop of lead time.
     assert held["lead_s"] == pytest.approx(1.9)
     assert held["false_alarms_per_hour"] == 0.0
     proposed = figures(CalibratedCue("proposed", 0.02), streets)
@@ -135,7 +135,7 @@ def test_rules_on_posteriors_with_a_known_answer(streets):
 
 
 def test_a_recording_sets_nothing_that_is_applied_to_it(streets):
-    """One loud hazard-free recording raises the thresholds of the others, and none of its own."""
+    """One loud hazard-free recording raises the thresholds of the others, but not its own."""
     loud = told(streets[10], np.full(HOPS, 0.99))
     said = asked(CalibratedCue("proposed", 0.0), [*streets[:10], loud, *streets[11:]])
     assert said[10].alarm.any()
@@ -152,7 +152,7 @@ STREETS = st.lists(
 @settings(max_examples=40)
 @given(kinds=STREETS, minutes=st.integers(0, 9), seed=st.integers(0, 99))
 def test_what_calibrates_is_not_tested(kinds, minutes, seed):
-    """Every recording is tested once; a junction that is left out is heard of nowhere else."""
+    """Every recording is tested once; a left-out junction occurs in no calibration set."""
     trials = [made_up(f"r{i}", label, hops=3, site=site) for i, (site, label) in enumerate(kinds)]
     trials += [
         made_up(f"quiet#{i:03d}", hops=3, site="quiet", stream="quiet") for i in range(minutes) if minutes > 1
@@ -171,7 +171,7 @@ def test_what_calibrates_is_not_tested(kinds, minutes, seed):
                 assert not {trials[i].site for i in calibration} & {trials[i].site for i in some}
                 assert not any(trials[i].site == "quiet" for i in some)
             else:
-                # Neighbouring minutes of a stream stay together: one apart would be half known.
+                # Neighbouring minutes of a stream are similar, so they stay in one fold.
                 held = [int(trials[i].name[-3:]) for i in some if trials[i].site == "quiet"]
                 assert held == list(range(held[0], held[-1] + 1)) if held else True
         if not protocol.by_junction:
@@ -209,7 +209,7 @@ def test_figures_of_few_recordings_come_with_a_caution(streets):
 
 
 def test_another_classifier_judges_what_was_heard(streets):
-    """Eq. (6) of the shipped classifier, hop by hop, from the kept features and answers."""
+    """Eq. (6) with the shipped classifier, hop by hop, from the cached features and camera answers."""
     signature = read_model().signature
     features = np.random.default_rng(2).uniform(0.05, 0.4, (HOPS, 60))
     asked_of = {"answer": np.full(HOPS, ABSENT), "miss_rate": np.full(HOPS, 0.3)}
@@ -226,7 +226,7 @@ def test_another_classifier_judges_what_was_heard(streets):
 
 
 def table_of(trials: Sequence[Trial]) -> FeatureTable:
-    """One window of each recording."""
+    """Return a table with one window of each recording."""
     columns = [
         np.array(column)
         for column in zip(*((t.hops.features[0], t.label, t.name, t.site) for t in trials), strict=True)
@@ -260,10 +260,10 @@ def test_simulated_training_windows_are_kept_and_are_of_other_recordings(tmp_pat
 
 @pytest.mark.long
 def test_another_model_hears_nothing_but_its_own_chain(tmp_path):
-    """What the front-end measured is read back; only the chain of the other model is run."""
+    """Results of the front-end come from the cache; only the chain of the other model is run."""
     sound = tmp_path / "quiet.wav"
     rng = np.random.default_rng(0)
-    # Something that comes from ahead: of the noise of microphones alone every model is as sure as it may be.
+    # With a source ahead: on microphone noise alone every model is at its limit of certainty.
     noise = 0.01 * (rng.standard_normal((75_000, 56)) + rng.standard_normal((75_000, 1)))
     soundfile.write(sound, noise, 48_000, subtype="FLOAT")
     write_array_xml(tmp_path / "array.xml", ovad_array())
@@ -328,7 +328,7 @@ def test_recordings_that_could_not_be_heard_are_named_where_too_few_are_left():
 
 @pytest.mark.parametrize("last_s", [4.5, 3.2])
 def test_the_pass_is_where_constant_speed_puts_it(last_s):
-    """Across the axis at 4 s, at 6 m/s in 8 m; the images end after it, or before."""
+    """The vehicle crosses the axis at 4 s with 6 m/s at 8 m; the images end after it, or before."""
     time_s = np.arange(1.0, last_s, 0.1)
     azimuth = np.arctan2(6.0 * (4.0 - time_s), 8.0)
     truth = HopTable({"time_s": time_s, "vehicle": np.zeros(len(time_s), int), "azimuth_rad": azimuth})
@@ -352,7 +352,7 @@ def test_front_end_figures_of_streets_with_a_known_answer(streets):
 
 
 def test_bearings_of_all_approaches_are_gated_together(streets):
-    """Errors of 1 and 3 degrees at prominences 2 and 1.2; the window without a box counts as neither."""
+    """Errors of 1 and 3 degrees at prominences 2 and 1.2; a window without a box is left out."""
     first = streets[0].hops
     three = {name: column[:3] for name, column in first.columns.items()}
     sure = replace(first, columns=three).replace(
@@ -376,6 +376,6 @@ def test_the_method_of_the_documentation_joins_by_one_line(streets):
     names: dict[str, type] = {}
     exec(compile(program, str(page), "exec"), names)
     found = figures(names["Prominent"](), streets)
-    # Approaches stand out all along here, the streets without a vehicle never.
+    # Approaches have a high score throughout here, streets without a vehicle never do.
     assert (found["detection"], found["false_alarms_per_hour"]) == (0.0, 0.0)
     assert found["early_onsets_per_approach"] == 1.0

@@ -1,4 +1,4 @@
-"""Protocols on made-up windows: nothing of a recording on both sides, every figure recomputable."""
+"""Protocols on artificial windows: no recording in both training and test, every figure reproducible."""
 
 import csv
 import json
@@ -39,7 +39,7 @@ KEYS = {
 
 
 def made_up_table(seed=0, recordings=72, spread=1.5):
-    """Half of the recordings hazard-free, the others a hazard and a front window."""
+    """Return a table with half of the recordings hazard-free, the others with a hazard and a front window."""
     rng = np.random.default_rng(seed)
     azimuth = np.tile(np.linspace(-1, 1, 30), 2)
     shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
@@ -97,7 +97,7 @@ def test_a_recording_is_labelled_by_its_hazard():
 
 
 class Spy(PublishedClassifier):
-    """Remembers what it was trained on and refuses to be asked about it."""
+    """Stores its training set and raises an error if it is applied to it."""
 
     def fit(self, X, y, groups=None):
         self.seen = {row.tobytes() for row in X}
@@ -139,14 +139,14 @@ def test_a_threshold_is_set_on_windows_compared_as_those_that_it_is_for(referenc
 
 
 def test_a_threshold_is_the_mean_over_streams_and_half_way_between_both_folds():
-    """Beside a level whose passes are far apart: a mean in log-odds would lie elsewhere."""
+    """With a level whose passes differ strongly, because a mean in log-odds would differ there."""
     table, rng = made_up_table(), np.random.default_rng(3)
     levels = [[rng.dirichlet(np.ones(4), len(table)) for _ in range(n)] for n in (2, 3)]
     learned = calibrate_passes(table, levels, alpha=0.1, miss_rate=0.0)
     sorted_scores = [
         [np.sort(hazard_statistic(one, 0.0)[table.hazard_free])[::-1] for one in level] for level in levels
     ]
-    # Just above the first window that a tenth of them cannot pay for.
+    # Just above the first window that would exceed a tenth of them.
     paid = int(0.1 * table.hazard_free.sum())
     expected = np.mean([np.mean([one[paid] for one in level]) for level in sorted_scores])
     assert learned.gamma == pytest.approx(expected, abs=1e-12)

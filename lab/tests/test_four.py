@@ -1,4 +1,4 @@
-"""The exam of a board of four microphones: made-up recordings with lost buffers, and the real ones."""
+"""Evaluation of a board of four microphones: artificial recordings with lost buffers, and the real ones."""
 
 import json
 import os
@@ -19,14 +19,14 @@ MODEL = os.environ.get("FOUR_MODEL", "")
 
 
 def late(sound: np.ndarray, by: Sequence[int]) -> np.ndarray:
-    """Return one sound in channels that lost so many samples before they began, (n, channels)."""
+    """Return one sound in channels that lost this many samples at the start, (n, channels)."""
     length = len(sound) - max(by)
     return np.stack([sound[start : start + length] for start in by], axis=1)
 
 
 def test_lost_buffers_are_found_and_given_back() -> None:
     sound = np.random.default_rng(0).standard_normal(3 * RATE)
-    # A board delays by a few samples.
+    # A board has delays of a few samples.
     recorded = late(sound, [2, 0, BUFFER + 1, 2 * BUFFER])
     assert lost_buffers(recorded, RATE) == (0, 0, 1, 2)
     whole = aligned(recorded, (0, 0, 1, 2))
@@ -37,7 +37,7 @@ def test_lost_buffers_are_found_and_given_back() -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two recordings for the model that ships, one with a lost buffer, and one that is not scored."""
+    """Two recordings for the shipped model, one with a lost buffer, and one that is not scored."""
     rng, n = np.random.default_rng(1), ovad_array().n_microphones
     kinds = (("OA", "left", "car"), ("IA", "right", "man"), ("IA", "right", "cart"))
     rows = ["file,site,side,kind,seconds"]
@@ -59,10 +59,10 @@ def test_every_recording_is_counted_once(folder: Path, capsys: pytest.CaptureFix
     assert found["by_group"]["OA left car"]["hazard_of"] == 1
     assert found["by_kind"]["man"]["hazard_of"] == 0
     assert found["side"]["of"] == found["hazard"]["pairs"] == 1
-    # One side alone is not balanced.
+    # With a single side there is no balanced accuracy.
     assert found["side"]["balanced"] is None
     assert found["persons"]["recordings"] == 1
-    # A buffer of 0.13 s is a hop and a half.
+    # A buffer of 0.13 s is one and a half hops.
     assert found["as_recorded"]["by_kind"]["car"]["hops"] - found["by_kind"]["car"]["hops"] in (1, 2)
 
 

@@ -1,4 +1,4 @@
-"""Prominence gating: coverage against accuracy, of bearings alone and of a recording beside its camera."""
+"""Prominence gating: coverage against accuracy, for bearings alone and for a recording with a camera."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_coverage_asked_for_is_kept_and_no_more_than_needed(
 
 
 def test_the_prominent_share_of_the_checked_bearings_is_counted() -> None:
-    """Three in ten bearings are prominent and 0.1 rad off, the others random; some have no box."""
+    """Three in ten bearings are prominent with errors of 0.1 rad, the others random; some have no box."""
     rng, n = np.random.default_rng(4), 400
     sure = rng.random(n) < 0.3
     error = np.where(sure, 0.1, rng.uniform(-np.pi, np.pi, n))

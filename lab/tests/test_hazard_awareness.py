@@ -26,7 +26,7 @@ PRIOR = (0.25,) * 4
 HOPS, T0_S = 60, 4.0
 STATES = {state.name: state for state in all_conditions()}
 BETA = dict(zip(LEVELS, (0.05, 0.3, 0.6, 0.9, 1.0), strict=True))
-# What the rain on the roof leaves of the signature's log-likelihoods.
+# Factor of the signature's log-likelihoods in rain on the roof.
 HEARD = dict(enumerate((1.0, 0.9, 0.6, 0.3, 0.0)))
 
 
@@ -35,7 +35,7 @@ def beta_of(state):
 
 
 def staged(number, approach, rng, hearing=3.0):
-    """A signature that is right most of the time, a camera that misses as its beta says."""
+    """Return a signature that is usually correct, and a camera that misses with probability beta."""
     time_s = 1.0 + 0.1 * np.arange(HOPS)
     hidden, visible = approach & (time_s > 2.0) & (time_s <= T0_S), approach & (time_s > T0_S)
     clear = np.zeros((HOPS, 4))
@@ -61,7 +61,7 @@ def staged(number, approach, rng, hearing=3.0):
 
 
 def changed(one, **columns):
-    """The same recording with other columns in every condition."""
+    """Return the same recording with other columns in every condition."""
     return {state: table.replace(**columns) for state, table in one.items()}
 
 
@@ -97,7 +97,7 @@ def test_vision_alone_decays_as_one_minus_beta_and_awareness_does_not(found):
 
 
 def test_awareness_is_counted_as_it_is_defined(corpus):
-    """Against loops over the hops, with thresholds that nothing and everything passes."""
+    """Compared with loops over the hops, with thresholds that every value, or none, exceeds."""
     for level, heard in ((2.0, False), (-1.0, True)):
         bent = [
             changed(one, presence=np.full(HOPS, 0.5 if one[OFF].hazard_free else level)) for one in corpus
@@ -113,7 +113,7 @@ def test_awareness_is_counted_as_it_is_defined(corpus):
 
 
 def test_false_alarms_keep_the_budget_of_the_clean_recording(found, corpus):
-    """The statistic falls as absence says less, and a detector without clutter adds no awareness."""
+    """The statistic falls as absence becomes weaker, and a detector without clutter adds no awareness."""
     clean, hours = found.row(CLEAN), found.hazard_free_hours
     dry = [row for row in found.rows if not row.condition.sound_level]
     assert all(row.false_alarms_per_hour.value <= clean.false_alarms_per_hour.value + 1e-9 for row in dry)
@@ -130,7 +130,7 @@ def test_false_detections_are_false_awareness_and_none_of_the_vehicle(found, cor
 
 
 def test_what_each_sense_covers_for_the_other_is_lost_when_one_cause_takes_both(found):
-    """The lens and the roof alone cost little, as the other sense is left; at once they cost half."""
+    """Lens or roof alone cost little, because the other sensor remains; together they cost half."""
     harshest = found.common_cause[-1]
     assert harshest.roof.value > 0.9
     assert harshest.lens.value > 0.6
@@ -157,7 +157,7 @@ def test_what_does_not_fit_is_refused(corpus):
 
 
 def counts(misses, looks=40):
-    """The same in every family; rows are azimuth bins."""
+    """Return the same counts for every family; rows are azimuth bins."""
     misses = tuple(map(tuple, misses))
     there = tuple((looks,) * len(LEVELS) for _ in misses)
     return dict.fromkeys(FAMILIES, FamilyCounts(there, misses, (10,) * 5, (1,) * 5))
@@ -171,7 +171,7 @@ def test_beta_is_misses_over_looks_with_the_spread_over_recordings():
     curves = beta_curves([counts(RISING)] * 6, draws)
     assert curves.by_azimuth.value[1] == pytest.approx(np.array(RISING) / 40.0)
     assert curves.overall.value[2] == pytest.approx(np.mean(RISING, axis=0) / 40.0)
-    assert curves.overall.low == pytest.approx(curves.overall.high)  # Recordings alike: nothing to spread
+    assert curves.overall.low == pytest.approx(curves.overall.high)  # Equal recordings have no spread
     assert curves.falls == ()
     other = [[40 - miss for miss in row] for row in RISING]
     mixed = beta_curves([counts(RISING)] * 3 + [counts(other)] * 3, draws)

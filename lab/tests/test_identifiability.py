@@ -29,7 +29,7 @@ def binary_entropy(p):
 
 
 def mutual_information_bits(joint):
-    """Exact I(z; x) of a joint table, by its definition."""
+    """Return the exact I(z; x) of a joint table by its definition."""
     independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
     there = joint > 0.0
     return float((joint[there] * np.log2(joint[there] / independent[there])).sum())
@@ -50,7 +50,7 @@ def test_the_binary_symmetric_channel(flip):
     joint = 0.5 * np.array([[1 - flip, flip], [flip, 1 - flip]])
     information = mutual_information_bits(joint)
     assert information == pytest.approx(1.0 - binary_entropy(flip), abs=1e-9)
-    # Fano is attained by the symmetric channel: its best detector errs with the flip probability.
+    # The symmetric channel attains Fano's bound: its best detector errs with the flip probability.
     assert sharp_fano_bound(1.0, information, 2) == pytest.approx(flip, abs=1e-6)
 
 
@@ -87,7 +87,7 @@ def gaussian_sample(n, distance, seed=0):
 
 
 def gaussian_information_bits(distance):
-    """Exact I of two unit Gaussians at a distance, equally likely, by quadrature."""
+    """Return the exact I of two equally likely unit Gaussians at a distance, by quadrature."""
     x = np.linspace(-8.0, 8.0 + distance, 20_001)
     p0, p1 = stats.norm.pdf(x), stats.norm.pdf(x - distance)
     mixed = (p0 + p1) / 2

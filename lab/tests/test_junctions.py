@@ -1,4 +1,4 @@
-"""Junctions that set no threshold: the command on a made-up corner of two junctions."""
+"""Thresholds from other junctions: the command on an artificial folder with two junctions."""
 
 import json
 
@@ -17,7 +17,7 @@ def corner(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def given(corner, tmp_path_factory):
-    """Return the words that name windows and the recordings left out of them."""
+    """Return the arguments for the windows and the recordings left out of them."""
     folder = tmp_path_factory.mktemp("windows")
     (folder / "ids.csv").write_text("ID\nnone_1\n0_left\n")
     features = write_csv(folder / "windows.csv", made_up_table(recordings=36, spread=0.3))
@@ -37,7 +37,7 @@ def test_every_junction_is_tested_by_the_others(given, capsys) -> None:
         assert row["interval"][0] <= row["alarms_per_hour"] <= row["interval"][1]
     assert fixed["proposed .02"]["paper"] == {"detection": 0.857, "false_alarms_per_hour": 97.0}
     assert retrained["proposed .02"]["paper"] == {"detection": 0.762, "false_alarms_per_hour": 282.0}
-    # What is trained without the tested junction says something else of it, what ships says the same.
+    # A classifier trained without the tested junction gives other results there, the shipped one the same.
     assert fixed["published"]["leads"] != retrained["published"]["leads"]
     assert fixed["shipped scores .02"] == retrained["shipped scores .02"]
 

@@ -1,4 +1,5 @@
-"""A renderer left out: none of its streams is learned, and its row is as loops over made-up alarms count."""
+"""A renderer left out: none of its streams is in the training, and its row matches loops over known
+alarms."""
 
 import json
 from itertools import pairwise
@@ -27,7 +28,7 @@ FIRST_LETTERS = {"paths": "S", "rays": "T", "mirrors": "M"}
 
 
 def made_up(site, traffic, seed, vehicles=HAZARDS, duration_s=46.0):
-    """Return a stream of `test_summed_scores` at a site, its vehicles in view for two seconds after T0."""
+    """Return a stream of `test_summed_scores` at a site, with vehicles in view for two seconds after T0."""
     one, rng = stream(vehicles, seed, duration_s), np.random.default_rng(seed)
     n, names = len(one.hops), ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
     rows = [
@@ -49,7 +50,7 @@ def made_up(site, traffic, seed, vehicles=HAZARDS, duration_s=46.0):
 
 
 def streets(seed):
-    """Return a short stream of each that is planned."""
+    """Return a short stream of each kind in the plan."""
     return [
         made_up(one.site.name, one.traffic.name, [seed, i], *(((), 20.0) if one.traffic.hazard_free else ()))
         for i, one in enumerate(learned_streams(FEW))
@@ -58,7 +59,7 @@ def streets(seed):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Two folds, noise for windows in the open, and an alarm by the readings alone: no filter runs."""
+    """Two folds, noise for open-field windows, and an alarm from the sequence alone: no filter runs."""
     rng = np.random.default_rng(9)
     monkeypatch.setattr(commission, "FOLDS", 2)
     monkeypatch.setattr(commission, "open_field_features", lambda *given: rng.uniform(0.5, 1.5, (12, 60)))
@@ -122,7 +123,7 @@ def test_the_command_judges_each_renderer_by_models_of_the_two_others(quick, mon
 
 
 def alarms(levels, threshold):
-    """Return by a loop whether each side is in alarm: at the threshold, and for a second after."""
+    """Return by a loop whether each side is in alarm: at the threshold, and for one second after."""
     on = np.zeros(levels.shape, bool)
     for side in (0, 1):
         for i in range(len(levels)):
@@ -159,7 +160,7 @@ def test_a_row_is_counted_as_loops_count_it(seed, budget):
     calm = judged[2:4]
     assert row["onsets_per_hour"] == pytest.approx(rate(row["threshold_nats"], calm))
     assert row["onsets_per_hour"] <= budget
-    # It is no higher than the budget asks for: at a threshold that 3 % more hops reach there are more onsets.
+    # It is no higher than the budget requires: a threshold exceeded by 3 % more hops has more onsets.
     highest = np.sort(np.concatenate([levels.max(axis=1) for _, levels in calm]))[::-1]
     reached = int((highest >= row["threshold_nats"]).sum())
     lower = highest[reached : int(1.03 * reached) + 2]

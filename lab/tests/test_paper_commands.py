@@ -19,7 +19,7 @@ def told(capsys, *argv):
 
 @pytest.fixture
 def table(tmp_path):
-    """Classes that differ in the level of one half of the azimuths each, with overlap."""
+    """Return classes that differ in the level of one half of the azimuths, with overlap."""
     rng = np.random.default_rng(0)
     labels = np.array(["front", "left", "none", "right"] * 30)
     features = rng.lognormal(-2.0, 0.3, (120, 60))

@@ -1,4 +1,4 @@
-"""What passes over recordings gave: kept whole, by content, and made again where it is damaged."""
+"""Results of passes over recordings: cached as a whole, by content, and computed again if damaged."""
 
 import os
 from dataclasses import replace
@@ -41,7 +41,7 @@ def assert_same(first, second):
         for column in one.columns:
             assert one.columns[column].dtype == other.columns[column].dtype
             np.testing.assert_array_equal(one.columns[column], other.columns[column])
-        # JSON text compares NaN as equal, which `==` does not.
+        # In JSON text NaN equals NaN, which `==` does not give.
         assert repr((one.name, one.label, one.t0_s, one.about)) == repr(
             (other.name, other.label, other.t0_s, other.about)
         )

@@ -1,4 +1,4 @@
-"""The whole world-state on made-up streams: who is warned of, who keeps an identity, who takes none."""
+"""The world-state on artificial streams: advisories, kept identities, and new entities."""
 
 import json
 import math
@@ -67,7 +67,8 @@ DUMB = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 def stream(
     vehicles: list[Vehicle], duration_s: float = 60.0, band_db: list[float] | None = None
 ) -> HeardStream:
-    """Return vehicles that cross the street ahead, seen between the corners, or come down the ego's own."""
+    """Return vehicles that cross the street ahead, visible between the corners, or come along the ego's
+    own."""
     loud_db = band_db or [60.0] * len(vehicles)
     rows, edge_m = [], STREET_M * math.tan(CORNER_RAD)
     for number, (flow, arm, entry_s) in enumerate(vehicles):
@@ -89,7 +90,8 @@ def stream(
     names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "band_db")
     columns = dict(zip(names, (np.array(column) for column in zip(*rows, strict=True)), strict=True))
     time_s = np.round(np.arange(1.0, duration_s, 0.1), 1)
-    # A pascal of noise is 94 dB: 40 dB of background, of which the band of 1.7 kHz is five ninths.
+    # White noise of one pascal has 94 dB: this gives 40 dB of background, of which the 1.7-kHz band has five
+    # ninths.
     middle = np.random.default_rng(4).normal(0.0, STEP_40_DB, (len(time_s), 600)).round().astype(np.int16)
     about = {"site": "SB2", "sample_rate_hz": 6000.0}
     hops = HopTable({"time_s": time_s, "middle": middle}, about=about)
@@ -98,12 +100,12 @@ def stream(
 
 
 def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
-    """Return what a good sequence model says: the group of `lag_s` ago, as sure as .8, and the camera."""
+    """Return measurements of a good sequence model (the group of `lag_s` ago, with 0.8) and of the camera."""
     groups = stream_truth(made_up).groups()
     said = np.full((*groups.shape, len(GROUPS)), 0.2 / (len(GROUPS) - 1))
     np.put_along_axis(said, groups[..., None], 0.8, -1)
     said = np.concatenate([np.repeat(said[:1], round(lag_s * 10), axis=0), said])[: len(groups)]
-    # As often in view as vehicles that come at that rate are for three seconds each.
+    # In view as often as vehicles with that arrival rate, each in view for three seconds.
     share = np.full(len(GROUPS), 0.02)
     share[GROUPS.index("seen")] = 0.24
     share[GROUPS.index("none")] = 1.0 - 0.24 - 0.02 * (len(GROUPS) - 2)
@@ -125,7 +127,7 @@ def test_a_vehicle_is_warned_of_keeps_its_identity_and_raises_nothing_once_it_is
     told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
     assert (told["approaches"], told["detected"], told["other_side_too"]) == (2, 1.0, 0.0)
     assert (told["identity_judged"], told["identity_kept"]) == (2, 1.0)
-    # The sequence says "coming" for another .4 s after T0: it is the one that the camera has in view.
+    # The sequence reports "coming" for another 0.4 s after T0: this is the vehicle that the camera detects.
     assert told["onset_after_pass"] == 0.0
     assert (told["seen_ahead"], told["took_hidden_identity"]) == (1, 0.0)
     assert told["skill_2s"] is not None and told["skill_2s"] > 0.3
@@ -154,7 +156,7 @@ SINGLES: list[Vehicle] = [("left", "left", 30.0), ("right", "right", 48.0)]
 
 
 def stated(made_up: HeardStream, chance: float, *, masked: bool = False) -> PassedStream:
-    """Return a stream of which nothing is believed but one chance of either side at every hop."""
+    """Return a stream with one constant chance for either side at every hop and no other beliefs."""
     n = len(made_up.hops)
     none = np.zeros((n, 2), bool)
     within, times = np.full((n, 2, 4), chance), np.full((n, 2, 3), np.nan)
@@ -188,10 +190,10 @@ def test_one_that_comes_is_ranked_above_one_that_drives_off_and_a_sure_chance_is
 
 
 def test_second_vehicles_are_judged_at_the_odds_of_the_street() -> None:
-    """One of three firsts has a second one from the other side: stated as a third, it costs nothing."""
+    """One of three vehicles is followed by one from the other side: a chance of one third has no loss."""
     group = "other, 1.5 to 4 s"
     told = second_figures([stated(stream(PAIR + SINGLES), 1.0 / 3.0, masked=True)])
-    # As loud as the first, it adds three decibels: nothing is masked.
+    # It is as loud as the first and adds three decibels, so nothing is masked.
     assert (told[f"{group}: approaches"], told[f"{group}: hops of 1 dB"]) == (1, 29)
     assert told[f"{group}: skill"] == pytest.approx(0.0, abs=1e-9)
     assert told[f"{group}: ECE"] is None and told["behind, 1.5 to 4 s: approaches"] == 0
@@ -223,7 +225,7 @@ def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
     group = "other, 1.5 to 4 s"
     assert (told[f"{group}: stated apart"], told[f"{group}: merged"]) == (1, 0.0)
     assert told[f"{group}: identity kept"] == 1.0
-    # One whose side is not known is the first's, and apart only as far as it is likelier the second's.
+    # An entity of unknown side belongs to the first vehicle, and to the second only as far as it is likelier.
     shares = SideShare("left", 0.8, 0.8, 0.1), SideShare("right", 0.2, -0.8, 0.1)
     single = tuple(
         tuple(replace(one, sides=shares) for one in hop if one.status == "hidden" and one.direction == "left")
@@ -231,7 +233,7 @@ def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
     )
     unknown = PassedStream(made_up, passed.truth, replace(follow, entities=single))
     assert second_figures([unknown])[f"{group}: stated apart"] == 0
-    # What ends in another one was merged, whatever is seen later.
+    # An entity that ends in another one is a merge, whatever is detected later.
     ids = frozenset(one.id for hop in follow.entities for one in hop)
     merged = PassedStream(made_up, passed.truth, replace(follow, merged=ids))
     assert second_figures([merged])[f"{group}: merged"] == 1.0
@@ -258,7 +260,7 @@ def test_the_meter_reads_decibels_above_the_place_as_it_was() -> None:
     above = above_place_db(replace(made_up, hops=hops))
     assert np.abs(above[50:300]).max() < 2.0
     assert above[305:320] == pytest.approx(np.full(15, 20.0), abs=2.0)
-    # After the burst the place is what it was: a fifth of the past is below either.
+    # After the burst the quiet level is the same as before: a fifth of the past is below either.
     assert np.abs(above[330:]).max() < 2.0
 
 
@@ -302,7 +304,7 @@ def test_the_hops_of_gusts_are_those_in_which_the_wind_is_loud(tmp_path: Path) -
     (rendered, in_gust), (again, _) = (scenarios.followed(plan, read_model(), tmp_path) for _ in range(2))
     np.testing.assert_array_equal(rendered.followed.risk, again.followed.risk)
     assert 30 < in_gust.sum() < len(in_gust) - 30
-    # Below 150 Hz wind is all there is: without vehicles the level tells the hops apart.
+    # Below 150 Hz there is only wind: without vehicles the level separates the hops.
     samples = rendered.heard.hops.middle.astype(float)
     low = sosfilt(butter(4, 150.0, fs=6000.0, output="sos"), samples.ravel()).reshape(samples.shape)
     power = lfilter(np.full(10, 0.1), 1.0, np.square(low).mean(axis=1))
@@ -310,7 +312,7 @@ def test_the_hops_of_gusts_are_those_in_which_the_wind_is_loud(tmp_path: Path) -
 
 
 def test_the_guard_speaks_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
-    """One that takes everything for foreign: as by `AcousticAdapter`, evidence and what was heard shrink."""
+    """A guard that classifies everything as foreign reduces evidence and `heard`, as in `AcousticAdapter`."""
     made_up, rng = stream([("left", "left", 12.0)], duration_s=16.0), np.random.default_rng(1)
     n = len(made_up.hops)
     refused = dict.fromkeys(
@@ -333,7 +335,7 @@ def test_the_guard_speaks_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
         for one in (None, guard)
     )
     judged = [(one, other) for one, other in zip(plain, guarded, strict=True) if other.domain is not None]
-    assert len(plain) - len(judged) == 20  # two seconds of sound are judged
+    assert len(plain) - len(judged) == 20  # two seconds of sound are classified
     for one, other in judged:
         assert isinstance(other.domain, Foreign)
         assert other.signature == neutral(one.signature, guard.margin)
@@ -366,7 +368,8 @@ def test_a_hidden_bearing_lies_behind_the_edge_and_is_mirrored(seed: int, edge_r
 @given(st.floats(0.0, 8.0))
 @settings(max_examples=20)
 def test_a_known_edge_narrows_the_bearing_and_keeps_the_errors_of_the_time(edge_deg: float) -> None:
-    """An edge less sure than the usual one adds all of its variance, a surer one leaves half of the usual."""
+    """An edge less certain than the usual one adds all of its variance, a more certain one leaves half of
+    it."""
     coming = np.full(len(COMING_S), 1.0 / len(COMING_S))
 
     def variance(degrees: float) -> float:
@@ -385,20 +388,20 @@ def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_b
     costs, hops = bench.costs(made_up, heard(made_up), WorldFilter(Context()))
     assert hops.tolist() == pytest.approx([50, 24], abs=1)
     per_hop = {method: cost / hops[:, None] for method, cost in costs.items()}
-    # One vehicle, of which nothing is said: 30 degrees a hop for a miss, and no others.
+    # One vehicle without an estimate: 30 degrees per hop for a miss, and no other costs.
     np.testing.assert_allclose(per_hop[bench.SILENCE], [[0.0, 30.0, 0.0]] * 2, atol=1e-9)
     hidden, visible = per_hop[bench.WORLD].sum(axis=1)
     assert hidden < 15.0 and visible < 15.0
     for tracker in (bench.UNHEARING, bench.OC_SORT, bench.GM_PHD, bench.GM_PHD_ENDS, bench.JPDA):
         hidden, visible = per_hop[tracker].sum(axis=1)
-        # Without the sound nobody knows of whom no box has shown; a box, each of them follows.
+        # Without sound, no method detects a vehicle before its first box; with boxes, every method tracks it.
         assert hidden >= 29.0 and visible < 20.0 and per_hop[tracker][1, 0] < 10.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 def test_every_snapshot_of_a_stream_holds_to_the_laws(seed: int, tmp_path: Path) -> None:
-    """Of fifteen minutes each, two hours together."""
+    """Fifteen minutes each, two hours together."""
     streets = [junction_named(name) for name in ("SA1", "SA2", "SB1", "SB2")]
     settings = StreamSettings(streets[seed % 4], 15.0, seed, traffic_named("pairs"), sample_rate_hz=6000.0)
     (heard,) = hear_stream(settings, [ovad_array()])

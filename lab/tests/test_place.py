@@ -1,4 +1,4 @@
-"""A place behind the corner: paths against brute force, likelihood and filter by their laws, end to end."""
+"""Position behind the corner: paths against brute force, laws of likelihood and filter, end to end."""
 
 import runpy
 from pathlib import Path
@@ -42,7 +42,7 @@ def plane_waves(*azimuths_deg: float) -> np.ndarray:
 def test_a_reflection_is_the_shortest_way_by_its_wall(
     number: int, along_m: float, wall: tuple[str, float]
 ) -> None:
-    # Fermat: of all points of the wall, sound takes the one with the shortest way.
+    # Fermat: sound is reflected at the point of the wall with the shortest path.
     path = sound_paths(MODEL.walls, 7.15, np.array([along_m]), HZ)[number]
 
     def length(at: np.ndarray) -> float:
@@ -59,7 +59,7 @@ def test_who_is_out_of_sight_is_heard_from_the_near_corner() -> None:
     direct = sound_paths(MODEL.walls, 7.15, np.array([-20.0, -4.6, 4.6, 20.0]), HZ)[0]
     corner = np.arctan2(2.8, 4.45)
     assert direct.azimuth_rad == pytest.approx([-corner, -corner, corner, corner])
-    # Maekawa: 5 dB at the edge of the shadow, more the farther behind it and the higher the tone.
+    # Maekawa: 5 dB at the edge of the shadow, more for larger detours and higher frequencies.
     assert -10 * np.log10(direct.passed[1]) == pytest.approx(np.full(len(HZ), 4.9), abs=0.4)
     assert (direct.passed[0] < direct.passed[1]).all() and (np.diff(direct.passed[0]) < 0).all()
 
@@ -77,7 +77,7 @@ def test_scale_and_offset_of_a_spectrum_say_nothing(scale: float, offset: float,
 def test_a_mirrored_street_mirrors_the_likelihood() -> None:
     spectrum = np.random.default_rng(3).normal(size=len(AZIMUTHS))
     even, mirrored = model_of(2.0, 3.5), model_of(3.5, 2.0)
-    # Draws give the left and the right wall different factors; both orders of them are the same street.
+    # Draws give the left and the right wall different factors; exchanging them gives the same street.
     like = np.mean(even.heard_share, axis=0)
     assert np.mean(mirrored.heard_share, axis=0)[::-1] == pytest.approx(like, abs=0.05)
     found, other = even.log_likelihood(spectrum)[0], mirrored.log_likelihood(spectrum[::-1])[0]
@@ -108,7 +108,7 @@ def test_probabilities_sum_to_one(seed: int, dt_s: float) -> None:
 
 
 def test_a_prediction_moves_the_mean_by_its_speed() -> None:
-    # One vehicle at -5 m that goes left at 4 m/s; its speed may change, equally up and down.
+    # One vehicle at -5 m with 4 m/s to the left; its speed may change, with equal probability up and down.
     sharp = np.full_like(PLACES.unknown.log_present, -700.0)
     speed = 15 + 6
     sharp[speed, np.abs(MODEL.along_m + 5.0).argmin()] = 0.0
@@ -127,12 +127,12 @@ def test_what_is_passed_on_completes_what_was_known() -> None:
         carried = PLACES.predict(carried, 0.1)
     now, before = PLACES.estimate(belief), PLACES.estimate(carried)
     assert now.stated and not before.stated
-    # The first second alone is nearly the belief: before it nothing was known.
+    # The first second alone nearly gives the belief, because nothing was known before.
     first = added_position(now, before, MODEL.walls.crossing_m)
     assert first is not None
     assert first.position_m[1] == pytest.approx(now.mean_m, abs=2.0)
     assert first.position_m[1] > MODEL.walls.sight_m[1]
-    # Both together are the belief again.
+    # Both together give the belief again.
     weights = 1.0 / first.covariance[1][1], before.std_m**-2
     whole = (weights[0] * first.position_m[1] + weights[1] * before.mean_m) / sum(weights)
     assert (whole, sum(weights)) == pytest.approx((now.mean_m, now.std_m**-2))

@@ -1,4 +1,4 @@
-"""Planners at blind corners: whom they hit, when they brake, and whether they drive as a car can."""
+"""Planners at blind corners: collisions, braking, and the limits of the car."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,8 @@ PACE_MPS, ENTRY_Y_M, ENTRIES_S = 4.5, 4.0, (40.0, 80.0, 120.0, 160.0)
 
 
 def stream(name: str = "SB2", entries_s: tuple[float, ...] = ENTRIES_S, known: bool = True) -> BelievedStream:
-    """Return vehicles from the left and from the right by turns, the chance one in the 3 s before each T0."""
+    """Return vehicles alternately from the left and the right, with a chance of one in the 3 s before each
+    T0."""
     rows, near_m = [], site(name).lanes_m
     for number, entry_s in enumerate(entries_s):
         side = number % 2
@@ -82,13 +83,13 @@ def test_who_knows_brakes_for_vehicles_alone_and_who_knows_nothing_hits_them(ego
     assert chance["loud_recorded"] == 6 and chance["quiet_recorded"] == 2
     assert 0.9 < chance["less_at_0.05_low"] <= chance["less_at_0.05"] <= chance["less_at_0.05_high"] <= 1.0
     assert phantom["less_at_0.2"] == 0.0
-    # Sight only grows as the car nears: what lies behind its edge may have come from farther behind it.
+    # Sight only grows as the car approaches: a vehicle just beyond its edge may come from farther behind.
     for remembered, assumed in zip(planners[MEMORY], planners[PHANTOM], strict=True):
         np.testing.assert_array_equal(remembered.front_m, assumed.front_m)
 
 
 def remembered(sight_m: np.ndarray, driven_m: float) -> np.ndarray:
-    """Return how near a vehicle may be that was never in sight, step by step."""
+    """Return the smallest distance of a vehicle that was never in sight, step by step."""
     found = [sight_m[:1]]
     for now in sight_m[1:, None]:
         found.append(unseen_from_m(found[-1], now, driven_m))
@@ -105,15 +106,16 @@ def test_no_unseen_vehicle_within_the_limit_is_nearer_than_memory_allows(
     nearest = remembered(sight_m, limit_m)
     assert (nearest >= sight_m).all()  # never nearer than the plain phantom
     driven = np.cumsum(rng.uniform(0.0, limit_m, steps))
-    unseen = (sight_m + driven).max() - driven  # as near as it can be without having been seen
+    unseen = (sight_m + driven).max() - driven  # the smallest distance without having been seen
     assert (unseen >= nearest - 1e-9).all()
-    # And at the limit there is one that is as near at the end and was behind the edge all the time.
+    # And the bound is tight: a vehicle at the speed limit ends at this distance and was always beyond the
+    # edge.
     tight = nearest[-1] + limit_m * (step[-1] - step)
     assert (tight >= sight_m - 1e-9).all()
 
 
 def test_memory_of_a_view_that_a_lorry_shuts_ends_when_a_vehicle_can_have_come_so_far() -> None:
-    # 40 m seen, then 5 m: at 7 m/s the 35 m between take five seconds.
+    # 40 m visible, then 5 m: at 7 m/s the 35 m between take five seconds.
     time_s = np.arange(0.0, 8.0, 0.05)
     nearest = remembered(np.where(time_s == 0.0, 40.0, 5.0), 7.0 * 0.05)
     np.testing.assert_allclose(nearest, np.maximum(40.0 - 7.0 * time_s, 5.0), atol=1e-9)

@@ -1,4 +1,4 @@
-"""Risks shifted without labels until hazards are as frequent as they were in training."""
+"""Risks shifted without labels until hazards are as frequent as in training."""
 
 import numpy as np
 import pytest

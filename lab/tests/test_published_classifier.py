@@ -22,7 +22,7 @@ from worldstate.ground.serialisation import decode, encode
 
 
 def windows(rng, n=240, spread=1.3):
-    """Four overlapping classes with the mirror symmetry of the real ones."""
+    """Return four overlapping classes with the mirror symmetry of the real ones."""
     labels = rng.permutation(np.repeat(CLASSES, n // 4))
     azimuth = np.tile(np.linspace(-1, 1, 30), 2)
     shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}

@@ -1,4 +1,4 @@
-"""Golden runs on the released windows of OVAD: what the published pipeline reaches."""
+"""Reference runs on the released windows of OVAD: results of the published pipeline."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,8 @@ def test_static_cross_validation_reaches_what_was_published():
     assert 0.91 <= figures["accuracy"] <= 0.93
     assert figures["auroc_pooled"] == pytest.approx(0.976, abs=0.006)
     assert figures["tpr"] == pytest.approx(0.74, abs=0.07)
-    # Law 4 promises the budget where gamma was set; out of fold it holds within what 199 windows can tell.
+    # Law 4 guarantees the budget on the data that set gamma; out of fold it holds within the error of 199
+    # windows.
     assert figures["fpr"] <= 0.05
     assert figures["ece"] <= figures["ece_floor"] + 0.02
     assert figures["auroc_pooled_absent"] > figures["auroc_pooled"]
@@ -61,7 +62,7 @@ def test_an_unseen_junction_is_harder():
 @pytest.mark.slow
 def test_a_moving_ego_is_harder_still():
     figures = evaluated("dynamic", "cv", seeds=5)
-    # .770 over five dynamic junctions, of which two are not in this copy.
+    # 0.770 over five dynamic junctions, of which two are not in this copy.
     assert figures["accuracy"] == pytest.approx(0.77, abs=0.03)
 
 
@@ -81,9 +82,9 @@ def test_the_model_that_ships_holds_on_the_official_test_recordings():
     figures = report(
         table, [predict_held_out(read_model(), table, 0.02, "curated", np.random.default_rng(0))]
     )
-    # The authors' own classifier has .928 there, retrained from this table .920: two more classes and the
-    # share of hazards in streams cost accuracy, not order; windows of a second renderer another .03,
-    # of a third .02, while the order gains (.984 before it).
+    # The authors' own classifier has 0.928 there, retrained on this table 0.920: two more classes and the
+    # share of hazards in streams reduce accuracy but not ranking. Windows of a second renderer cost another
+    # 0.03 and of a third 0.02, while the ranking improves (0.984 before it).
     assert figures["accuracy"] == pytest.approx(0.83, abs=0.02)
     assert figures["auroc_pooled"] > 0.985
     assert figures["auroc_pooled_absent"] > 0.98

@@ -1,4 +1,4 @@
-"""Golden runs of the method on the released windows of OVAD, beside what it has to beat."""
+"""Reference runs of the method on the released windows of OVAD, compared with its baselines."""
 
 import csv
 import json
@@ -45,20 +45,20 @@ def test_a_standing_ego_at_a_junction_never_seen():
 
 @pytest.mark.long
 def test_a_moving_ego_at_a_junction_never_seen():
-    # Three of five junctions here, so that each classifier learns from two.
+    # Three of five junctions are available, so each classifier is trained on two.
     figures = compared("dynamic", "lojo")
     assert figures["auroc_macro"] >= 0.885
     assert figures["auroc_pooled"] >= 0.88
     assert figures["accuracy"] >= 0.69
     assert figures["tpr"] >= 0.48
     assert figures["fpr_p_value"] >= 0.05
-    # The stated risks are overconfident: each classifier learns from two junctions only.
+    # The predicted risks are overconfident: each classifier is trained on two junctions only.
     assert figures["ece"] <= figures["ece_floor"] + 3 * figures["ece_floor_std"]
 
 
 @pytest.mark.slow
 def test_what_a_stream_brings_lies_between_nothing_and_the_curated_windows():
-    # A moving ego's level says little at a junction unless the junction is known; three passes, one table.
+    # With a moving ego, the level is informative only at known junctions; three passes, one table.
     table = read_features(TABLE).group("dynamic")
     rows = [row_of("worldstate", "lojo", reference) for reference in ("cold", "run", "curated")]
     passes = run_passes(rows, table, "lojo", seeds=1, alpha=0.02)

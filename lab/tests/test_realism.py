@@ -1,4 +1,4 @@
-"""The comparison of simulated with real windows, on sets whose answer is known and on the released ones."""
+"""The comparison of simulated with real windows, on sets with known results and on the released ones."""
 
 import json
 from dataclasses import replace
@@ -44,7 +44,8 @@ PLACES = ("SA1", "SA2", "SB1", "SB2")
 
 
 def windows(rng: np.random.Generator, n: int = 24, louder: float = 1.5, scale: float = 1.0) -> FeatureTable:
-    """Smooth made-up windows of four junctions, two louder; hazards are `louder`, their peak aside."""
+    """Return smooth artificial windows of four junctions, two louder; hazards are `louder`, their peak
+    aside."""
     labels = np.repeat(LABELS, n)
     middle = np.select([labels == "left", labels == "right"], [22.0, 7.0], 14.5)[:, None]
     bump = np.exp(-0.5 * ((np.arange(30) - middle - rng.normal(0, 3, (4 * n, 1))) / 4.0) ** 2)
@@ -125,7 +126,7 @@ def test_the_side_is_learned_from_other_junctions_and_is_chance_where_labels_are
 
 
 def test_the_mirrored_street_has_the_same_side():
-    """Left and right exchanged, features and labels: the same accuracy, and the same odd profile."""
+    """With left and right exchanged in features and labels, accuracy and odd profile are the same."""
     table = windows(np.random.default_rng(7))
     swapped = np.select([table.labels == "left", table.labels == "right"], ["right", "left"], table.labels)
     about = table.ids, table.environments, table.recordings, table.t0_frames
@@ -137,7 +138,7 @@ def test_the_mirrored_street_has_the_same_side():
 
 
 def test_the_share_between_sites_is_that_of_their_offsets():
-    """Sites that differ by known offsets in pattern and in level, in random windows."""
+    """Random windows of sites with known offsets in pattern and in level."""
     rng = np.random.default_rng(8)
     table = windows(rng, n=400)
     offsets = dict(zip(PLACES, rng.normal(0.0, 0.2, (len(PLACES), 60)), strict=True))
@@ -168,7 +169,7 @@ def test_a_set_without_hazards_is_refused():
 @pytest.mark.long
 @needs_released_windows
 def test_the_released_windows_have_the_known_figures():
-    """Figures of the released windows that were computed by another program (review of the simulation)."""
+    """Figures of the released windows that another program computed (review of the simulation)."""
     real = read_features(FOLDER / TABLE).group("static")
     figures = set_figures(real)
     for windows_of, sd in (("hidden", 0.151), ("front", 0.130), ("none", 0.264)):
@@ -184,14 +185,14 @@ def test_the_released_windows_have_the_known_figures():
     assert min(sides.values()) > 0.8
     far = np.array([odd_profiles(real)[name][1, 4:8] for name in ("SB1", "SB2", "SB3")])
     assert 0.01 < far.min() < far.max() < 0.14
-    # Two tuning junctions against the rest: an area near the lower end of .92 to .96.
+    # Two tuning junctions against the rest: an area near the lower end of 0.92 to 0.96.
     held = halves(sorted(set(real.environments.tolist())))[-1]
     assert str(held) == "SA2 SB3 | SA1 SB1 SB2"
     assert two_sample_area(*held.tables(real), np.random.default_rng(1)) == pytest.approx(0.92, abs=0.015)
 
 
 def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
-    """Band-limited noise from one side, at both rates: the same bins, hence the same feature."""
+    """Band-limited noise from one side at both rates: the same bins, hence the same feature."""
     rng, n = np.random.default_rng(6), 48_000
     longer = n + DECIMATION * feature_nfft(RATE_HZ)
     offsets = ovad_array().centred_m
@@ -205,10 +206,11 @@ def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
     arrays = ovad_array(), permuted_array()
     quarter, permuted = window_features(sound[:n:DECIMATION].astype(np.float32), arrays)
     assert full.max() > 1.2 * full.mean()
-    # The independent noise beyond 6 kHz folds back at the lower rate; it is 20 dB down at 1 kHz.
+    # The independent noise beyond 6 kHz aliases at the lower rate; it is 20 dB down at 1 kHz.
     np.testing.assert_allclose(quarter, full, atol=0.12 * full.max())
     assert np.argmax(quarter[:30]) == np.argmax(full[:30])
-    # With permuted positions no beam adds up at high frequencies; at low ones the microphones stand together.
+    # With permuted positions no beam is coherent at high frequencies; at low ones the spacing does not
+    # matter.
     assert np.ptp(permuted) < 0.7 * np.ptp(quarter)
 
 
@@ -224,7 +226,8 @@ def test_the_windows_of_a_simulated_approach_are_features_by_right_and_permuted_
 
 
 def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
-    """They end at T0, a frame, or half a second later if the ego moves; the front window 1.5 s after."""
+    """They end at T0, one frame later, or half a second later if the ego moves; the front window 1.5 s
+    after."""
     ends, entries = {}, []
 
     def rendered(scene, rng):
@@ -253,7 +256,7 @@ def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
 
 @pytest.mark.long
 def test_the_command_holds_given_windows_against_a_table(tmp_path, capsys):
-    """Windows that were made before, at some of the junctions, without simulating."""
+    """With existing windows of some of the junctions, without a simulation."""
     rng = np.random.default_rng(9)
     write_features(tmp_path / "real.csv", windows(rng))
     made = windows(rng)
@@ -270,7 +273,7 @@ def test_the_command_holds_given_windows_against_a_table(tmp_path, capsys):
     assert [
         one["simulated"]["made"] > 0.9 for one in report["rows"] if one["figure"].startswith("transfer")
     ] == [True] * 2
-    # The same features twice: nothing is lost by the positions, which is not as asked.
+    # With the same features twice, the positions cause no loss, which misses the requirement.
     lost = [one for one in report["rows"] if one["figure"] == "loss by permuted positions: shipped model"]
     assert [(one["simulated"], one["met"]) for one in lost] == [({"made": 0.0}, {"made": False})]
     assert (tmp_path / "r" / "realism.png").stat().st_size > 50_000

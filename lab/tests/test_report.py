@@ -1,4 +1,4 @@
-"""The report: whole files, nothing from outside as markup, the paper's numbers beside ours."""
+"""The report: complete files, external text never as markup, the paper's numbers beside ours."""
 
 import csv
 import io
@@ -54,7 +54,7 @@ def small_document(text, draw=plot):
 def test_what_comes_from_outside_is_text_and_never_markup():
     text = markdown_page(small_document(HOSTILE), "report_files")
     rows = [line for line in text.splitlines() if line.startswith("|")]
-    # A bar or a line break of a name would change the number of cells.
+    # A bar or a line break in a name would change the number of cells.
     assert {line.replace("\\|", "").count("|") for line in rows} == {3}
     assert "<script" not in text
     assert "\\[t](http" in text
@@ -106,7 +106,7 @@ def test_numbers_of_the_paper_agree_with_each_other():
         of("against the sustained rule", "fewer_false_alarms"), abs=0.005
     )
     assert 1.0 / of("proposed .02", "hazard_free_hours") == pytest.approx(9.7, abs=0.05)
-    # Onsets are whole: every rate of the static set is a multiple of the quantum, up to rounding.
+    # Onsets are whole numbers: every rate of the static set is a multiple of the quantum, up to rounding.
     for one in PAPER_VALUES:
         if one.figure == "false_alarms_per_hour" and one.group == "static":
             onsets = one.value * of("proposed .02", "hazard_free_hours")
@@ -126,7 +126,7 @@ def test_area_under_the_drawn_curve_is_the_auroc(seed):
 
 
 def heard(name, site, label, seed):
-    """A recording whose likelihoods rise in the last two seconds before T0."""
+    """Return a recording whose likelihoods rise in the last two seconds before T0."""
     rng = np.random.default_rng(seed)
     time_s = 1.0 + 0.1 * np.arange(60)
     near = (label != "none") & (time_s > 3.0) & (time_s < 5.0)
@@ -158,7 +158,7 @@ METHODS = (
 
 
 def run_of(protocol, trials):
-    """What `run_protocol` gives, without a classifier: the trials hold its posteriors already."""
+    """Return the result of `run_protocol` without a classifier: the trials already contain its posteriors."""
     said = {method.name: {} for method in METHODS}
     for calibration, tested in protocol.parts(trials, np.random.default_rng(0)):
         for method in METHODS:
@@ -265,7 +265,7 @@ def test_an_approach_without_video_is_drawn_without_images_and_says_so():
 
 
 def degradation(detectors):
-    """A sweep in which beta is .1 a level and awareness .98 less .01 a level."""
+    """Return a sweep in which beta is 0.1 per level and awareness is 0.98 minus 0.01 per level."""
     shape = (len(FAMILIES), 5)
     overall = np.broadcast_to(0.05 + 0.1 * np.arange(5), shape)
     wide = np.broadcast_to(overall[:, None], (shape[0], 3, shape[1]))

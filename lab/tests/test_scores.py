@@ -1,4 +1,4 @@
-"""From decisions to figures: closed-form cases, other people's formulas, and laws of the bootstrap."""
+"""From decisions to figures: closed-form cases, independent formulas, and laws of the bootstrap."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def close(ours, theirs):
 
 
 def windows(trials, answers, column, horizon_s=np.inf):
-    """Values and labels of all scored windows, gathered the plain way."""
+    """Return values and labels of all scored windows, collected by a simple loop."""
     values, labels = [], []
     for trial, said in zip(trials, answers, strict=True):
         left_s = trial.t0_s - trial.hops.time_s
@@ -73,7 +73,7 @@ def test_alarms_that_are_known():
 
 
 def test_the_hop_at_t0_and_the_one_five_seconds_before_it():
-    # 0.1 is no binary fraction: the hop that ends at T0 = 6.3 s must not count as a lead of 1e-15 s.
+    # 0.1 is not exact in binary: the hop that ends at T0 = 6.3 s must not count as a lead of 1e-15 s.
     trials = [made_up("a", "left", t0_s=0.1 * 63), made_up("b", "left", t0_s=0.1 * 63), made_up("c")]
     answers = [alarmed(trials[0], [(6.3, 7.0)]), alarmed(trials[1], [(1.3, 1.5)]), alarmed(trials[2], [])]
     score = Score.of(trials, [answers])
@@ -82,7 +82,7 @@ def test_the_hop_at_t0_and_the_one_five_seconds_before_it():
 
 
 def test_stamps_half_a_sample_off_change_nothing():
-    # At 47,998 Hz a window ends up to 10 us beside its tenth of a second, before or after T0.
+    # At 47,998 Hz a window ends up to 10 us from its nominal time, before or after T0.
     rng = np.random.default_rng(10)
     trials, (answers,) = random_study(rng)
     shifted, said = [], []
@@ -132,7 +132,8 @@ def test_figures_of_windows_are_those_of_other_formulas():
 
 
 def test_a_track_that_is_late_and_changes_its_name():
-    # In view for ten hops, tracked 5 degrees off from the third on, under another name in the last two.
+    # In view for ten hops, tracked with an error of 5 degrees from the third on, with another identity in the
+    # last two.
     trial, calm = made_up("a", "left"), made_up("c")
     seen = np.flatnonzero(np.isfinite(trial.hops.reference_rad))
     there, names = np.zeros(81, bool), np.zeros(81, int)
@@ -188,7 +189,7 @@ def test_angles_wrap_and_a_fast_camera_changes_nothing():
     behind = np.full(81, -np.pi + 0.05)
     tracks = tracked(trial, np.ones(81, bool), np.zeros(81, int), behind)
     answers = [alarmed(trial, [], bearing_rad=behind, tracks=tracks), alarmed(calm, [])]
-    # Three images in each hop, and a vehicle in view before the first window.
+    # Three images per hop, and a vehicle in view before the first window.
     time_s = np.round(np.arange(0.0, 9.0, 1 / 30), 6)
     seen = (time_s < 0.5) | (time_s > 5.05) & (time_s < 6.05)
     rows = zip(time_s, np.zeros(len(time_s)), np.full(len(time_s), np.pi - 0.05), seen, strict=True)
@@ -220,7 +221,7 @@ def test_a_method_that_no_seed_changes_is_scored_once():
     score, thrice = Score.of(trials, [answers]), Score.of(trials, [answers] * 3)
     close(thrice.figures(), score.figures())
     assert thrice.wins.shape == score.wins.shape
-    # Copies may differ in what is not compared: they are scored like any other pass.
+    # Copies may differ in fields that are not compared: they are scored like any other pass.
     assert len(Score.of(trials, [answers, [replace(one) for one in answers]]).wins) == 2
 
 
@@ -258,7 +259,7 @@ def test_a_mirrored_world_has_the_same_figures():
     ]
     ours = Score.of(trials, [answers]).figures()
     close(ours, Score.of(mirrored, [turned]).figures())
-    # A method that does not see that the world is mirrored is right where it was wrong.
+    # A method that ignores the mirroring is right where it was wrong before.
     assert Score.of(mirrored, [answers]).figures()["side_correct"] != ours["side_correct"]
 
 
@@ -281,7 +282,7 @@ def test_a_method_is_as_good_as_itself():
 
 
 def detector(trials, rate, rng):
-    """Detects each approach with a probability, a second before T0."""
+    """Return alarms that detect each approach with a given probability, a second before T0."""
     return [
         alarmed(trial, [(4.0, 4.5)] if not trial.hazard_free and rng.random() < rate else [])
         for trial in trials
@@ -302,7 +303,8 @@ def test_intervals_hold_the_truth_in_most_experiments():
         held += low <= 0.7 <= high
         _, low, high = paired(a, b, draws)["detection"]
         held_difference += low <= 0.2 <= high
-    # 95 % less what a bootstrap of 40 recordings lacks; four standard deviations of the share are .12.
+    # 95 % minus the undercoverage of a bootstrap of 40 recordings; four standard deviations of the share are
+    # 0.12.
     assert 0.82 < held / 50 <= 1.0
     assert 0.82 < held_difference / 50 <= 1.0
 
@@ -318,7 +320,7 @@ def test_false_alarms_have_their_exact_interval():
 
 
 def scored(trial, levels):
-    """An answer of which only the score counts: a level from each start on, for half a second."""
+    """Return decisions of which only the score is used: a level from each start on, for half a second."""
     time_s, score = trial.hops.time_s, np.full(len(trial.hops), 0.01)
     for start_s, level in levels:
         score[(time_s > start_s - 1e-6) & (time_s < start_s + 0.5 - 1e-6)] = level
@@ -329,7 +331,7 @@ def test_false_alarms_are_compared_where_both_detect_as_much():
     near = [made_up(f"a{i}", "left", t0_s=7.0) for i in range(10)]
     calm = [made_up("c"), made_up("d")]
     trials = [*near, *calm]
-    # Ours tells nine of ten apart from a burst of its own that is as high as the tenth, the baseline none.
+    # Ours separates nine of ten from a false burst that is as high as the tenth; the baseline separates none.
     ours = [scored(one, [(5.5, 0.9 if i else 0.2)]) for i, one in enumerate(near)]
     ours += [scored(calm[0], [(3.0, 0.5)]), scored(calm[1], [])]
     theirs = [scored(one, [(5.5, 0.6)]) for one in near] + [
@@ -341,7 +343,7 @@ def test_false_alarms_are_compared_where_both_detect_as_much():
     assert tuple(found) == DETECTED
     assert found[0.9].ours == 0.0 and found[0.9].baseline == pytest.approx(4 / hours)
     assert found[0.9].ratio == found[0.9].low == 0.0
-    # The tenth costs the burst.
+    # Detecting the tenth costs the burst as a false alarm.
     assert found[0.95].ours == pytest.approx(1 / hours) and found[0.95].ratio == pytest.approx(0.25)
     assert found[0.95].low == 0.0 and found[0.95].high <= 0.5
     assert not equal_detection(trials, {BASELINE: [theirs]}, draws)
@@ -374,7 +376,7 @@ def test_what_a_method_does_not_state_is_not_there():
         "lead_s",
     }
     assert all(np.isnan(figures[name]) for name in silent)
-    # Log odds are a score, but no probability.
+    # Log-odds are a score, but not a probability.
     odds = [alarmed(one, [], score=np.linspace(-3.0, 3.0, 81)) for one in trials]
     figures = Score.of(trials, [odds]).figures()
     assert np.isnan(figures["ece_raw"]) and np.isfinite(figures["auroc_all"])

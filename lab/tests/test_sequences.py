@@ -1,4 +1,4 @@
-"""Scores of real recordings: figures of made-up ones that are known, and the command on a made-up corner."""
+"""Scores of real recordings: known figures of artificial ones, and the command on an artificial corner."""
 
 import csv
 import json
@@ -36,7 +36,8 @@ EVIDENCE = Path(__file__).resolve().parents[2] / "docs" / "evidence"
 
 
 def corner(approaches=4, calm=4, *, t0_s=5.0, hops=81, start_s=0.0):
-    """Approaches from the right and the left in turn at two junctions, and recordings without a vehicle."""
+    """Return approaches alternately from right and left at two junctions, and recordings without a
+    vehicle."""
     labels = [("right", "left")[i % 2] for i in range(approaches)] + ["none"] * calm
     trials = [
         made_up(f"r{i}", label, t0_s=t0_s - start_s, hops=hops - round(10 * start_s), site=f"S{i // 2 % 2}")
@@ -47,7 +48,7 @@ def corner(approaches=4, calm=4, *, t0_s=5.0, hops=81, start_s=0.0):
 
 
 def before(trial, first_s, last_s=0.0):
-    """Whether a hop of an approach ends from `first_s` to `last_s` before T0."""
+    """Return which hops of an approach end from `first_s` to `last_s` before T0."""
     left_s = trial.t0_s - trial.hops.time_s
     return (left_s < first_s + 1e-6) & (left_s > last_s - 1e-6) & (not trial.hazard_free)
 
@@ -71,7 +72,8 @@ def test_a_score_that_rises_two_seconds_before_sight_separates_from_there_on() -
 
 def test_hops_of_hazard_free_recordings_count_as_many_as_they_are() -> None:
     trials = corner(2, 2)
-    # In a quarter of all hazard-free hops the score is that of an approach, at the compared hop it is not.
+    # In a quarter of all hazard-free hops the score equals that of an approach, at the compared hop it does
+    # not.
     high = np.arange(81) >= 61
     scores = [before(one, 1.0).astype(float) if not one.hazard_free else high.astype(float) for one in trials]
     found = leads(trials, scores, None, draw())["1"]
@@ -104,7 +106,7 @@ def test_an_alarm_at_the_first_hop_is_an_onset_and_leads_from_there() -> None:
     assert row["lead_s"] == row["lasting_lead_s"] == pytest.approx(7.0)
     assert row["leads_beyond_5_s"] == [7.0, 7.0]
     assert row["text"] == "2 of 2 at 2 false onsets"
-    # From 2 s after T0 at 8.0 s nothing is heard any more: the last hop ends at 9.0 s.
+    # T0 is at 8.0 s and the last hop ends at 9.0 s: there are no hops from 2 s after T0 on.
     assert row["after_pass_share"] is None
     hours = 2 * 81 * 0.1 / 3600
     assert row["alarms_per_hour"] == pytest.approx(2 / hours)
@@ -113,7 +115,7 @@ def test_an_alarm_at_the_first_hop_is_an_onset_and_leads_from_there() -> None:
 
 def test_an_alarm_lasts_that_stands_half_a_second_before_sight() -> None:
     trials = corner(2, 2)
-    # Both begin 3 s before T0; that of the second one falls, and begins again too late.
+    # Both begin 3 s before T0; the second alarm ends, and begins again too late.
     alarms = [before(trials[0], 3.0), before(trials[1], 3.0, 1.0) | before(trials[1], 0.3)]
     row = alarm_row(trials, [[*alarms, *(np.zeros(81, bool),) * 2]], draw())
     assert (row["count"], row["lasting_count"], row["onsets"]) == (2.0, 1.0, 0.0)
@@ -135,7 +137,7 @@ def test_passes_are_means_over_the_same_hours() -> None:
 
 def test_a_row_of_the_curve_has_one_threshold() -> None:
     trials = corner(2, 8)
-    # At 0.5 both are warned of for one onset, at 0.3 both longer for two; at 0.9 one for none, late.
+    # At 0.5 both are warned for one onset, at 0.3 both longer for two; at 0.9 one for none, late.
     scores = [np.where(before(one, 1.0), 0.5, np.where(before(one, 3.0), 0.3, 0.0)) for one in trials]
     scores[0][before(trials[0], 0.3)] = 0.9
     scores[2][10], scores[3][20:30] = 0.6, 0.3
@@ -169,7 +171,7 @@ def test_chances_are_held_against_the_side_that_something_comes_from() -> None:
 
     true = calibration([stated(one, 1.0) for one in trials], draw())
     assert (true["ece"], true["brier_skill"]) == (0.0, 1.0)
-    # Before T0 at 5.0 s, from 1.0 s on: 40 hops an approach, 20 of them within 2 s; 81 without a hazard.
+    # Before T0 at 5.0 s, from 1.0 s on: 40 hops per approach, 20 of them within 2 s; 81 without a hazard.
     assert true["base_rate"] == pytest.approx(2 * 20 / (2 * 2 * (40 + 81)))
     half = calibration([stated(one, 0.5) for one in trials], draw())
     assert half["ece"] == pytest.approx(0.5 * true["base_rate"])
@@ -215,7 +217,7 @@ def test_the_command_scores_a_made_up_corner(tmp_path, capsys) -> None:
     assert list(found["at_onsets"]) == ["0", "1", "3", "6"]
     assert found["leads"]["2"]["approaches"] == 2
     assert found["leads"]["3"]["approaches"] == 0
-    # A vehicle whose sound doubles each half second is told from a quiet street.
+    # A vehicle whose sound doubles each half second is separated from a quiet street.
     assert found["scores"]["loudness meter"]["leads"]["0.5"]["auroc"] == 1.0
     assert found["scores"]["window alone"]["leads"]["0.5"]["auroc"] == 1.0
     assert "sequences corner" in json.loads((tmp_path / "results.json").read_text())
@@ -237,7 +239,7 @@ def test_the_filter_that_ships_is_the_product_and_every_way_of_windows_is_anothe
             for figure in ("auroc", "auroc_all_hops", "side_auroc"):
                 assert ships["leads"][lead][figure] == score["leads"][lead][figure]
     assert ships["within_1s"]["brier_skill"] is not None
-    # No way is another one under a second name.
+    # All variants differ from one another.
     first, *others = (windows["sound alone"][one.name]["at_onset"]["threshold"] for one in FILTERS)
     assert len({first, *others}) == len(FILTERS)
 
@@ -248,7 +250,7 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
     printed = capsys.readouterr().out
     assert "seven: 2 approaches, 2 hazard-free recordings" in printed
     assert "risk, sound alone" in printed
-    # Of 3 s that are left T0 is at 2 s: the first hop ends a second before.
+    # In the remaining 3 s T0 is at 2 s: the first hop ends a second before.
     assert "0 + 0" in printed
 
 

@@ -1,4 +1,4 @@
-"""The signature study: what a linear signature tells, on other recordings and on the other corpus."""
+"""The signature study: separability by a linear signature, on other recordings and on the other corpus."""
 
 import json
 
@@ -26,7 +26,7 @@ RECORDINGS = {TOWN_ROAD: 4, CITY_STREET: 2}
 
 @pytest.fixture(scope="module")
 def clips():
-    """What two simulated corpora hold: labels and samples by street."""
+    """Return the content of two simulated corpora: labels and samples by street."""
     return {
         street: [
             clip
@@ -89,7 +89,8 @@ def corpus(clips, street):
 
 
 def drawn(rng, recordings, clips, *, fingerprint=0.0, lift=0.0):
-    """Draw a corpus of clips: each recording of one class, with a mark of its own, vehicles `lift` louder."""
+    """Draw a corpus of clips: each recording has one class and a mark of its own; vehicles are `lift`
+    louder."""
     rows = []
     for number in range(recordings):
         kind = ("car", BACKGROUND)[number % 2]
@@ -153,7 +154,7 @@ def test_clips_repeated_within_their_recordings_do_not_narrow_the_interval():
 @pytest.mark.long
 def test_simulated_road_users_are_as_loud_as_their_kind(clips):
     heard = corpus(clips, CITY_STREET)
-    # Above the wind, in which a bicycle drowns.
+    # Above the band of the wind, which masks a bicycle.
     level = {kind: heard.energy[heard.kinds == kind, 9:13].mean() for kind in np.unique(heard.kinds)}
     assert level["truck"] > level["car"] > level[BACKGROUND] + 0.5
     assert level["bicycle"] == pytest.approx(level[BACKGROUND], abs=1.0)

@@ -1,4 +1,4 @@
-"""Staged videos of a corner, searched by a stand-in, and what is counted of them: no recording is needed."""
+"""Staged videos of a corner, searched by a simple detector, and counts of its boxes; needs no recording."""
 
 import json
 from itertools import chain
@@ -23,12 +23,13 @@ from worldstate_lab.sequences.staged_video import Staging, stage_recording
 from worldstate.adapters.camera.detections import DetectionFrame
 
 WIDTH, HEIGHT, IMAGES, T0 = 240, 162, 40, 2.0
-# Of the video's first and last row nothing is searched, and NanoDet's stand-in searches every second image.
+# The first and last row of the video are not searched, and the substitute for NanoDet searches every second
+# image.
 CLEAN, DARK, NOISY = Condition("clean"), Condition("darkness", 4), Condition("noise", 1)
 
 
 def block(number):
-    """Return left and right of what moves from the image of T0 on, None before."""
+    """Return left and right edge of the moving block from the image of T0 on, None before."""
     left = 6 * (number - 20)
     return (left, left + 60) if left >= 0 else None
 
@@ -46,7 +47,7 @@ class Bright:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two junctions with an approach and a hazard-free recording each, as the recordings lie."""
+    """Two junctions with an approach and a hazard-free recording each, in the layout of the recordings."""
     folder = tmp_path_factory.mktemp("corner")
     rows = [
         (f"{name}{site}", site, side)

@@ -1,4 +1,4 @@
-"""The statistic over a stream, with the parts of it that an ablation removes."""
+"""The statistic over a stream, with switches for the parts that an ablation removes."""
 
 import numpy as np
 import pytest

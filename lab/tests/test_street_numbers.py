@@ -1,4 +1,4 @@
-"""Numbers of the street model from streams whose geometry, rates and boxes are known."""
+"""Parameters of the street model from streams with known geometry, rates and boxes."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def test_of_peaks_of_which_some_are_anywhere_share_and_spread_are_found(share, s
 @given(st.floats(0.02, 0.3), st.integers(2, 9), st.integers(0, 4))
 @settings(max_examples=10)
 def test_tracks_single_boxes_and_growth_are_counted(growth: float, vehicles: int, single: int) -> None:
-    """Of every vehicle six images, then none for a second; single boxes stand in images of their own."""
+    """Every vehicle has six images, then none for a second; single boxes are in images of their own."""
     quiet, look, hops = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0), Present(0.05, 0.01), []
     for image in range(16 * (vehicles + single)):
         number, at = divmod(image, 16)

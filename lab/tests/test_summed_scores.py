@@ -1,4 +1,4 @@
-"""Sums of sequence, window and levels: what they are made of, and what is learned of simulated streams."""
+"""Sums of sequence, window and levels: their terms, and the training on simulated streams."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def reading(streams, model):
 
 
 def trial(columns, unknown=0):
-    """Return a recording of which so many first hops have no columns."""
+    """Return a recording whose first hops have no columns."""
     n = len(columns)
     given = np.array(columns)
     given[:unknown] = np.nan
@@ -109,7 +109,7 @@ def test_a_hop_without_columns_has_the_usual_log_odds(reading, model, streams) -
 
 def test_sums_are_means_over_three_hops_of_what_they_are_made_of(streams, model) -> None:
     columns = stream_evidence(parts_of(model)[0], streams[0])
-    # The path of two microphones hears a hop more.
+    # The path of two microphones has one hop more.
     seven, pair = trial(columns[100:150]), trial(columns[160:211], unknown=3)
     found = {
         name: one[0]

@@ -41,7 +41,7 @@ def test_every_row_of_the_table_is_there(smoke):
     assert set(report["protocols"]) == {"static", "junctions_fixed", "junctions_retrained"}
     assert "dynamic" in report["lacking"] and "moving ego" in report["lacking"]["dynamic"]
     assert "SIMULATED" in report["data"]
-    # Two recordings of either kind say nothing, and the report says that.
+    # Two recordings of either kind are too few, and the report states this.
     assert len(report["cautions"]["static"]) == 2
 
 
@@ -53,7 +53,7 @@ def test_line_of_sight_says_nothing_before_sight(smoke):
 
 @pytest.mark.slow
 def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, tmp_path, capsys):
-    """With two streams that cannot be heard: they are named and left out, and every table says so."""
+    """With two unreadable streams: they are listed and left out, and every table states this."""
     out, report = smoke
     kept = {path: path.stat().st_mtime_ns for path in (out / "cache").rglob("*.npz")}
     broken = [tmp_path / name for name in ("cut.wav", "two.wav")]
@@ -127,7 +127,7 @@ def test_streets_whose_simulation_was_interrupted_are_completed(smoke, tmp_path)
 
 @pytest.mark.slow
 def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys):
-    """Three recordings are left, and no protocol can be run on one approach."""
+    """Three recordings remain, and no protocol can be run with one approach."""
     out, _ = smoke
     shutil.copytree(out / "smoke", tmp_path / "smoke", copy_function=os.link)
     shutil.copytree(out / "cache", tmp_path / "cache")
@@ -144,7 +144,7 @@ def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys
 
 @pytest.mark.slow
 def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
-    """The others are scored, and the model that ships, which was made for another array, is not."""
+    """The other methods are scored, but not the shipped model, which was made for another array."""
     root, out = tmp_path / "data", tmp_path / "out"
     eight = MicrophoneArray(ovad_array().positions_m[::7], "eight microphones")
     write_dataset(root, DatasetSettings(n_static=6, duration_s=8.0), array=eight)
@@ -163,7 +163,7 @@ def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
     text = (out / "report.md").read_text(encoding="utf-8")
     assert "shipped model | not scored: the model was not made for this sound" in text
     assert "not scored: " in capsys.readouterr().out
-    # A model that is named is refused at once: somebody asked for it.
+    # A model given explicitly is rejected at once.
     save_model(tmp_path / "model.json", read_model())
     model = ["--model", str(tmp_path / "model.json")]
     assert main(["table", str(root), "--out", str(tmp_path / "no"), *model]) == 2

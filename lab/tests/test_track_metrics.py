@@ -19,7 +19,7 @@ HOP_S = 0.1
 
 
 def brute_gospa(estimates, truths, cutoff, order):
-    """Every way to pair the fewer with some of the more, each pair cut off."""
+    """Return the GOSPA by trying every assignment of the smaller set to the larger, each pair cut off."""
     fewer, more = sorted((list(estimates), list(truths)), key=len)
     ways = permutations(more, len(fewer))
     costs = [
@@ -35,7 +35,7 @@ def brute_gospa(estimates, truths, cutoff, order):
 @few
 def test_gospa_is_the_cheapest_of_all_assignments(estimates, truths, cutoff, order):
     errors = np.abs(np.angle(np.exp(1j * np.subtract.outer(estimates, truths))))
-    # At the cut-off itself a pair is worth as much as a miss and a ghost, and round-off decides.
+    # At the cut-off a pair costs as much as a miss and a false estimate, so round-off would decide.
     assume((np.abs(errors - cutoff) > 1e-9).all())
     one = gospa_bearing(estimates, truths, cutoff, order)
     assert one.total_rad == pytest.approx(brute_gospa(estimates, truths, cutoff, order), abs=1e-9)
@@ -77,19 +77,19 @@ def test_gospa_is_a_metric(a, b, c):
 
 
 def truth(hops, source=1, azimuth_rad=0.0, active=True):
-    """One source at one bearing."""
+    """Return one source at one bearing."""
     n = len(hops)
     return TruthRows(np.array(hops), np.full(n, source), np.full(n, azimuth_rad), np.full(n, active))
 
 
 def tracks(hops, names, azimuth_rad=0.0):
-    """Estimates at one bearing, or one each."""
+    """Return estimates at one bearing, or one each."""
     names = np.broadcast_to(names, len(hops))
     return TrackRows(np.array(hops), names, np.broadcast_to(azimuth_rad, len(hops)).astype(float))
 
 
 def joined(*parts):
-    """Rows of several sources or tracks together."""
+    """Return the rows of several sources or tracks together."""
     kind = type(parts[0])
     return kind(*(np.concatenate([getattr(p, f) for p in parts]) for f in kind.__slots__))
 
@@ -139,7 +139,7 @@ def test_silence_is_never_quick():
 
 
 def test_clear_mot_holds_what_it_matched_where_the_nearest_would_swap():
-    """Two sources side by side, whose tracks cross between them without leaving the gate."""
+    """Two adjacent sources, whose tracks cross between them without leaving the gate."""
     both = joined(truth(range(2), 1, 0.05), truth(range(2), 2, -0.05))
     crossing = joined(tracks(range(2), 7, [0.05, -0.05]), tracks(range(2), 8, [-0.05, 0.05]))
     said = track_measures(crossing, both, HOP_S)
@@ -148,7 +148,7 @@ def test_clear_mot_holds_what_it_matched_where_the_nearest_would_swap():
 
 
 def test_tracks_to_one_side_of_their_sources_keep_their_order():
-    """Either way round costs the same there, but for round-off."""
+    """Both assignments cost the same there, except for round-off."""
     hops, rng = range(50), np.random.default_rng(0)
     both = joined(truth(hops, 1, 0.0), truth(hops, 2, 0.1))
     beside = joined(*(tracks(hops, name, 0.1 * name + rng.uniform(0.0, 0.05, 50)) for name in (2, 3)))
@@ -206,7 +206,7 @@ def test_errors_of_stated_times_in_closed_form():
     errors = visible_errors(stated, true)
     assert (errors.count, errors.rmse_s) == (3, pytest.approx((5 / 3) ** 0.5))
     assert (errors.coverage, errors.width_s) == pytest.approx((2 / 3, 2.0))
-    # A method may state a time without an interval, as a cue does: its error counts, its coverage does not.
+    # A method may give a time without an interval, like a cue: its error counts, its coverage does not.
     stated[0, 0] = stated[1, 2] = np.nan
     alone = visible_errors(stated, true)
     assert (alone.count, alone.intervals, alone.rmse_s) == (3, 1, errors.rmse_s)

@@ -1,4 +1,4 @@
-"""Readers of roadside corpora, on small folders written in their published layouts."""
+"""Readers of roadside corpora, on small folders in their published layouts."""
 
 import re
 from itertools import product
@@ -57,7 +57,7 @@ def test_idmt_clips_carry_what_their_names_say(tmp_path):
     assert [one.microphone for one in labels] == ["mems", "studio", "studio", "mems"]
     assert [one.split for one in labels] == ["train", "train", "test", "test"]
     assert [one.site for one in labels[::2]] == ["Fraunhofer-IDMT", "Langewiesener-Strasse"]
-    # Both microphones heard one passage: a fold that parted them would test on what it learned.
+    # Both microphones recorded one passage: a fold that separated them would test on training data.
     assert labels[0].recording == labels[1].recording != labels[2].recording == labels[3].recording
     samples, rate_hz = read_clip(clips[0])
     assert samples.shape == (16_000, 2)

@@ -1,6 +1,6 @@
-"""What a user of tracks relies on at a corner: on made-up recordings, and on the real ones if they are there.
+"""Properties of tracks at a corner: on artificial recordings, and on the real ones if they are available.
 
-OVAD_SEQUENCES names the folder of real ones, which else lies beside the repository; OVAD_ROOT names the whole
+OVAD_SEQUENCES is the folder of the real recordings, by default beside the repository; OVAD_ROOT is the whole
 data set in its own layout.
 """
 
@@ -25,7 +25,7 @@ from worldstate.state import Entity
 
 SEQUENCES = Path(os.environ.get("OVAD_SEQUENCES") or Path(__file__).parents[4] / "shared" / "ovad-sequences")
 ROOT = os.environ.get("OVAD_ROOT")
-# Of GOSPA at 60 degrees: what one vehicle costs that no track stands for.
+# GOSPA at 60 degrees for one vehicle without a track.
 MISS_DEG = 30.0
 
 
@@ -34,7 +34,7 @@ def figures(found):
 
 
 def believed_s(chain, recording):
-    """Return when vehicles are believed hidden and when in view, seconds."""
+    """Return the times at which vehicles are believed hidden and in view, in seconds."""
     found = {"hidden": [], "visible": [], "emerged": []}
     for step in chain.steps(recording):
         for one in step.state.entities:
@@ -62,7 +62,7 @@ class Scripted(Chain):
         return replace(state, entities=tuple(hidden))
 
 
-# Four vehicles of a second each in view, and two streets without one; at SB1 a car is parked.
+# Four vehicles in view for a second each, and two streets without one; at SB1 a car is parked.
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     folder = tmp_path_factory.mktemp("corner") / "made-up"
@@ -96,7 +96,7 @@ def test_a_vehicle_in_view_is_an_entity_of_its_side_within_a_tenth_of_a_second(a
 
 def test_a_bearing_in_view_is_that_of_the_vehicle_and_no_camera_enters_it(chain, approaches):
     found = figures(approaches)["tracking"]["bearing"]["all"]
-    # The vehicle moves by 3 degrees from an image to the next one.
+    # The vehicle moves by 3 degrees between images.
     assert found["median_deg"] < 3.0
     assert found["nees_mean"] < 1.0
     assert min(found["images_later_s"].items(), key=lambda one: one[1])[0] in ("0", "0.1")
@@ -108,7 +108,7 @@ def test_a_bearing_in_view_is_that_of_the_vehicle_and_no_camera_enters_it(chain,
 def test_tracks_last_through_images_that_are_withheld(approaches):
     found = figures(approaches)["tracking"]["gospa_deg"]["all"]
     assert found[WORLD]["total"] < 0.2 * MISS_DEG
-    # It links boxes by their overlap, of which 0.2 s leave too little here.
+    # It links boxes by their overlap, which is too small after 0.2 s here.
     assert found[WORLD]["total"] < found[OC_SORT]["total"] <= MISS_DEG + 1e-9
 
 
@@ -129,7 +129,7 @@ def test_identity_is_that_of_the_entity_that_was_hidden(chain, recordings, hidde
 
 @pytest.fixture(scope="module", params=["seven", "pair"])
 def real(request):
-    """The chain of one path, the real recordings, and the figures of the approaches among them."""
+    """The chain of one path, the real recordings, and the figures of their approaches."""
     if not (SEQUENCES / TRUTH).is_file():
         pytest.skip(f"no real recordings in {SEQUENCES.name}: set OVAD_SEQUENCES")
     path = ovad_chain(read_model(None))
@@ -142,7 +142,8 @@ def real(request):
     return path, every, figures([tracked(path, one) for one in every if not one.hazard_free])
 
 
-# Floors that a break falls below. Beside each stands what was measured on the 45: seven microphones, two.
+# Lower limits that a defect would violate. The comments give the values on the 45 recordings: seven
+# microphones, two microphones.
 
 
 @pytest.mark.long
@@ -156,7 +157,7 @@ def test_identity_is_kept_from_hidden_into_view(real):
 @pytest.mark.long
 def test_vehicles_are_handed_over_at_once(real):
     found = real[2]["tracking"]["hand_over"]
-    # All, at 0.0 s in the median and 0.1 s at the 90 % quantile, on both.
+    # All, with a median of 0.0 s and a 90 % quantile of 0.1 s, on both paths.
     assert found["found"] > 0.85
     assert found["median_s"] < 0.15 and found["late_s"] < 0.35
 
@@ -171,13 +172,14 @@ def test_a_time_to_visible_holds_what_it_states(real):
     found = real[2]["tracking"]["before_t0"]
     assert found["stated"] > 0.3  # 13 and 10 of 23
     assert found["time_error_s"] < 1.5  # 0.67, 0.91 s
-    assert found["time_coverage"] > 0.75  # 0.97 and 0.93, where 0.9 is stated
+    assert found["time_coverage"] > 0.75  # 0.97 and 0.93 for a nominal 0.9
 
 
 @pytest.mark.long
 def test_acoustic_bearings_in_view_are_near_moving_boxes(real):
     found = real[2]["tracking"]["bearing"]["all"]
-    # 11.6 and 6.4 degrees; 3.3 of the seven against images 0.5 s later: the rows of their spectra are early.
+    # 11.6 and 6.4 degrees; 3.3 with seven microphones against images 0.5 s later, because the rows of their
+    # spectra are early.
     assert found["median_deg"] < 15.0
     assert min(found["images_later_s"].values()) < 8.0
     assert found["nees_mean"] < 3.0  # 1.3, 0.5
@@ -194,7 +196,7 @@ def test_there_are_few_vehicles_where_none_is(real):
     path, every, _ = real
     calm = [one for one in every if one.hazard_free][::4]
     found = [believed_s(path, one) for one in calm]
-    # Of the snapshots of all 22, 0.05 have one in view by the camera, 0.003 a hidden one.
+    # Of the snapshots of all 22, 0.05 contain a vehicle in view by the camera, 0.003 a hidden one.
     assert np.sum([len(one["visible"]) for one in found]) < 0.2 * 90 * len(calm)
     assert np.sum([len(one["hidden"]) for one in found]) < 0.05 * 90 * len(calm)
 
@@ -208,7 +210,7 @@ def takes():
 
 @pytest.fixture(scope="module")
 def heard(takes, tmp_path_factory):
-    """The static approaches as the whole array hears them."""
+    """The static approaches processed with the whole array."""
     hearing = Hearer(tmp_path_factory.mktemp("heard"))
     return [hearing(one) for one in takes.static if not one.hazard_free]
 
@@ -235,7 +237,7 @@ def test_of_all_microphones_the_dynamic_list_is_heard_if_it_is_there(takes, tmp_
 
 
 def _was_there_before(trial):
-    """Whether the track that is nearest to the vehicle, in most images of it, began before T0."""
+    """Return whether the track nearest to the vehicle in most of its images began before T0."""
     tracks, nearest = trial.chains["filtered"].tracks, []
     seen = trial.truth.in_view.astype(bool) & (trial.truth.vehicle == 0)
     for time_s, azimuth_rad in zip(trial.truth.time_s[seen], trial.truth.azimuth_rad[seen], strict=True):
