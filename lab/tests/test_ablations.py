@@ -93,7 +93,7 @@ def test_without_answers_the_absence_switch_does_nothing():
     assert table["signature_only"] == table["full"]
 
 
-def test_what_cannot_be_evaluated_is_refused():
+def test_recordings_that_cannot_be_evaluated_are_rejected():
     streams = corpus(count=8)
     with pytest.raises(InvalidArgumentError, match="hazard-free"):
         evaluate_ablation([s for s in streams if not s.hazard_free], PRIOR, np.random.default_rng(0))

@@ -88,7 +88,7 @@ def test_a_better_method_shows_and_an_equal_one_does_not(tmp_path):
     assert same.differences["detection"] == (0.0, 0.0, 0.0)
 
 
-def test_what_cannot_be_compared_is_refused_with_the_difference(tmp_path):
+def test_incomparable_evaluations_are_rejected_with_the_difference(tmp_path):
     trials, passes, score = study(4, seeds=1)
     ours = evaluated(tmp_path / "ours", score)
     rng = np.random.default_rng(0)
@@ -109,7 +109,7 @@ def test_what_cannot_be_compared_is_refused_with_the_difference(tmp_path):
         compare(ours, edited, rng)
 
 
-def test_a_protocol_without_shared_recordings_stands_beside_one_with(tmp_path):
+def test_a_protocol_without_shared_recordings_does_not_affect_another(tmp_path):
     trials, passes, score = study(5, seeds=1)
     renamed = [replace(one, hops=one.hops.replace(name=f"new-{one.name}")) for one in trials]
     for name, second in [("a", score), ("b", Score.of(renamed, passes))]:
@@ -120,7 +120,7 @@ def test_a_protocol_without_shared_recordings_stands_beside_one_with(tmp_path):
     assert all(np.isnan(second.differences["detection"]))
 
 
-def test_folders_and_files_that_do_not_fit_are_refused(tmp_path):
+def test_unsuitable_folders_and_files_are_rejected(tmp_path):
     _, _, score = study(6, seeds=1)
     with pytest.raises(InputFileError, match="expected a finished evaluation"):
         load_scores(tmp_path)

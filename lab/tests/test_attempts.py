@@ -43,13 +43,13 @@ def test_any_number_of_processes_gives_the_same_and_reports_the_broken_recording
 
 @pytest.mark.long
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_of_the_program_is_no_broken_recording(jobs):
+def test_a_programming_error_is_not_a_broken_recording(jobs):
     with pytest.raises(TypeError, match="has no len"):
         list(attempted(len, [[0], 1, [2]], jobs))
 
 
 @pytest.mark.long
-def test_a_process_that_is_lost_is_an_error_not_an_endless_wait():
+def test_a_lost_process_is_an_error_and_not_an_endless_wait():
     with pytest.raises(WorldstateError, match="a process ended before its work was done"):
         list(attempted(end_at_one, [0, 1, 2], 2))
 
@@ -88,7 +88,7 @@ ASKED = [pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGI
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGKILL, *ASKED])
-def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same(number, tmp_path):
+def test_an_interrupted_run_resumes_with_the_same_result(number, tmp_path):
     write_sounds(tmp_path / "sounds", 8, seconds=1)
     (tmp_path / "cache").mkdir()
     run = start(tmp_path, 0.4)

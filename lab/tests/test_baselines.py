@@ -106,7 +106,7 @@ def test_identities_and_boxes_are_those_of_another_implementation(seed):
     assert agree(street(np.random.default_rng(seed))) > 10
 
 
-def test_it_agrees_on_the_boxes_of_a_recording(approach):
+def test_tracks_agree_on_the_boxes_of_a_recording(approach):
     frames = read_detections(approach.detections_path).frames
     assert agree((frame.boxes_px, frame.scores) for frame in frames) >= 1
 
@@ -114,7 +114,7 @@ def test_it_agrees_on_the_boxes_of_a_recording(approach):
 @pytest.mark.long
 @few
 @given(st.integers(15, 60), st.integers(1, 25))
-def test_a_tracker_coasts_after_it_has_seen_a_vehicle(first, hidden):
+def test_a_tracker_coasts_only_after_a_detection(first, hidden):
     """Seen for 8 images, hidden by a lorry, then seen again: only `coasting` is in alarm while hidden."""
     frames = np.r_[first : first + 8, first + 8 + hidden : first + 12 + hidden]
     before = vehicle(frames[:8], step_px=-10.0)
@@ -132,7 +132,7 @@ def test_a_tracker_coasts_after_it_has_seen_a_vehicle(first, hidden):
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 @few
 @given(first=st.integers(12, 90), seed=seeds)
-def test_nothing_warns_of_a_vehicle_that_was_never_in_sight(row, first, seed):
+def test_no_line_of_sight_method_warns_of_a_vehicle_never_in_sight(row, first, seed):
     rng = np.random.default_rng(seed)
     seen = np.r_[first, first + 1 + np.flatnonzero(rng.random(20) < 0.7)]
     of = trial(t0_s=first / 10, boxes=vehicle(seen))
@@ -141,7 +141,7 @@ def test_nothing_warns_of_a_vehicle_that_was_never_in_sight(row, first, seed):
     assert seen_early_s([of]) == 0.0
 
 
-def test_vision_names_the_side_of_the_widest_box():
+def test_vision_gives_the_side_of_the_widest_box():
     right, left = vehicle([30, 31], 1700.0), vehicle([30, 31], 200.0)
     wide = left.columns["box_px"] + np.array([-100.0, 0.0, 100.0, 0.0])
     both = {name: np.concatenate([column, left.columns[name]]) for name, column in right.columns.items()}
@@ -170,7 +170,7 @@ def test_the_rate_of_the_camera_splits_no_advisory(rate_hz):
     assert alarm.sum() * 0.1 == pytest.approx(3.0, abs=1.5 / rate_hz)
 
 
-def test_seen_early_tells_by_how_much():
+def test_seen_early_returns_the_time_before_t0():
     early = seen_early_s([trial(t0_s=5.0, boxes=vehicle(np.arange(first, 60))) for first in (47, 50, 53)])
     np.testing.assert_allclose(early, [0.3, 0.0, 0.0])
 
@@ -192,12 +192,12 @@ def test_radar_waves_do_not_turn_corners(azimuth_rad, entry):
 
 
 @pytest.mark.parametrize(("azimuth_deg", "share"), [(30.0, 0.9), (-59.0, 0.9), (61.0, 0.0), (-120.0, 0.0)])
-def test_radar_finds_what_is_in_its_view_as_often_as_it_says(azimuth_deg, share):
+def test_radar_detects_vehicles_in_view_at_its_stated_rate(azimuth_deg, share):
     of = trial(hops=4000, truth=truth(np.radians(azimuth_deg), True, 4010))
     assert said(RadarFieldOfView(), of).alarm.mean() == pytest.approx(share, abs=0.02)
 
 
-def test_radar_says_the_same_of_a_trial_in_whatever_order():
+def test_radar_gives_the_same_decisions_in_any_order():
     decide = RadarFieldOfView().fit([], np.random.default_rng(3))
     of = trial(truth=truth(0.3, True))
     first = decide(of).alarm
@@ -206,5 +206,5 @@ def test_radar_says_the_same_of_a_trial_in_whatever_order():
     assert not np.array_equal(said(RadarFieldOfView(), of).alarm, first)
 
 
-def test_without_a_camera_nothing_is_said():
+def test_without_a_camera_there_are_no_alarms():
     assert not any(said(row, trial()).alarm.any() for row in [*ROWS, RadarFieldOfView()])

@@ -58,7 +58,7 @@ def test_every_vehicle_of_the_timed_hops_is_followed():
         assert len(world.state.entities) == kept
 
 
-def test_text_names_kernel_threads_and_what_is_compared():
+def test_the_text_lists_kernel_threads_and_comparisons():
     report = {
         "blas": ("openblas 0.3 Any",), "rounds": 5, "load": 0.3, "settings": {"published_chain": "bins 1-15"},
         "costs": {name: {"median_ms": 0.25, "p99_ms": 0.5} for name in ("stft", "published_chain")},
@@ -69,7 +69,7 @@ def test_text_names_kernel_threads_and_what_is_compared():
         assert part in text
 
 
-def test_everything_that_is_timed_is_there():
+def test_the_timed_sound_exercises_every_stage():
     """The bench's sound exercises every stage: it has a source, a spectral line and a level."""
     sound = np.tile(_source(np.random.default_rng(0)), (2, 1))[: RATE_HZ * 5 // 2]
     sound += np.random.default_rng(1).standard_normal(sound.shape, dtype=np.float32)
@@ -81,7 +81,7 @@ def test_everything_that_is_timed_is_there():
     assert not isinstance(frame.character, NotUsable)
 
 
-def test_the_evidence_that_is_timed_is_read_from_whole_trees_and_a_guard_that_looks_closely():
+def test_the_timed_evidence_uses_complete_trees_and_a_guard_that_always_runs():
     rng = np.random.default_rng(0)
     # As in a street, most of the sound is common to the microphones.
     hops = [

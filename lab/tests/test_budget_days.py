@@ -46,7 +46,7 @@ def test_every_onset_of_whole_blocks_is_in_the_block_in_which_it_came() -> None:
     assert chance_blocks(streams).shape == (20, 180, 2)
 
 
-def test_a_budget_that_is_kept_is_not_called_broken_and_more_is_found_the_sooner_the_more_there_is() -> None:
+def test_a_kept_budget_is_not_reported_and_larger_excess_is_detected_sooner() -> None:
     streams = [street(12.0, seed) for seed in range(6)]
     found = dict(budget_days(streams, BUDGET, 40, np.random.default_rng(0)))
     assert found["as they are"]["broken"] == found["chances"]["broken"] == 0.0
@@ -57,7 +57,7 @@ def test_a_budget_that_is_kept_is_not_called_broken_and_more_is_found_the_sooner
 
 
 @pytest.mark.parametrize(("chance", "true"), [(0.4, 0.02), (0.02, 0.4)])
-def test_chances_that_do_not_come_true_are_found(chance: float, true: float) -> None:
+def test_chances_that_do_not_come_true_are_detected(chance: float, true: float) -> None:
     streams = [street(12.0, 1, chance, true)]
     found = dict(budget_days(streams, BUDGET, 5, np.random.default_rng(0)))
     assert found["chances"]["broken"] == 1.0
@@ -67,6 +67,6 @@ def test_no_onset_never_breaks_a_budget() -> None:
     assert broken_after_s([onset_factors(0, 10.0, BUDGET)] * 8640, 10.0) == np.inf
 
 
-def test_streams_without_a_false_onset_are_refused() -> None:
+def test_streams_without_a_false_onset_are_rejected() -> None:
     with pytest.raises(InvalidArgumentError, match=r"expected false onsets .*, got none in 60 minutes"):
         next(budget_days([street(0.0, 1)], BUDGET, 1, np.random.default_rng(0)))

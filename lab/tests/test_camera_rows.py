@@ -24,7 +24,7 @@ def hops(name, label, t0_s, *, advised, present, seen):
     return HopTable(columns, name, label, t0_s, {"site": "SA1"})
 
 
-def test_what_is_known_without_a_detection_counts_as_awareness():
+def test_a_high_presence_without_a_detection_counts_as_awareness():
     streams = [hops(f"f{i}", "none", np.nan, advised=False, present=0.1, seen=False) for i in range(5)]
     streams += [hops(f"a{i}", "left", 2.0, advised=i < 3, present=0.9, seen=False) for i in range(5)]
     row = product_row(streams, np.random.default_rng(0))
@@ -32,14 +32,14 @@ def test_what_is_known_without_a_detection_counts_as_awareness():
     assert (row["aware"], row["vision_only"], row["hazard_free_aware_SA1"]) == (1.0, 0.0, 0.0)
 
 
-def test_a_presence_as_high_as_in_quiet_streets_is_no_awareness():
+def test_a_presence_as_high_as_in_quiet_streets_is_not_awareness():
     streams = [hops(f"f{i}", "none", np.nan, advised=False, present=0.5, seen=False) for i in range(5)]
     streams += [hops(f"a{i}", "left", 2.0, advised=False, present=0.5, seen=False) for i in range(5)]
     assert product_row(streams, np.random.default_rng(0))["aware"] == 0.0
 
 
 @pytest.mark.long
-def test_the_command_prints_what_each_camera_is_worth(tmp_path, capsys):
+def test_the_command_prints_the_figures_of_each_camera(tmp_path, capsys):
     folder = write_corner(tmp_path / "corner", np.random.default_rng(0), approaches=4, hazard_free=4)
     assert main(["ablations", str(folder), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["states"]["boxes"]

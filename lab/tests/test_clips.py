@@ -24,7 +24,7 @@ def table(folder: Path, rows: list[tuple[str, str, str, str]]) -> Path:
     return path
 
 
-def test_files_of_several_rates_and_lengths_are_heard(
+def test_files_of_several_rates_and_lengths_are_processed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng, rows = np.random.default_rng(1), []
@@ -49,9 +49,7 @@ def test_files_of_several_rates_and_lengths_are_heard(
     assert by_files["kinds_log_loss_prior"] == 0.0
 
 
-def test_a_file_of_numbers_that_are_none_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_of_invalid_numbers_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "few.npz", character=np.zeros((3, 7)), clip=np.zeros(3, int))
     path = table(tmp_path, [("a.wav", "car", "r", "")])
     assert main(["clips", str(path), "--numbers", str(tmp_path / "few.npz")]) == 2
@@ -82,7 +80,7 @@ def test_probabilities_are_corrected_to_the_shares_of_the_table() -> None:
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="real sounds are beside the repository only")
-def test_real_vehicles_are_familiar_and_trams_are_no_trucks(tmp_path: Path) -> None:
+def test_real_vehicles_are_familiar_and_trams_are_not_trucks(tmp_path: Path) -> None:
     rows = list(csv.DictReader((REAL / "clips.csv").open()))
     known = {"car", "tram"}
     said = [(r["sound"], r["kind"], r["recording"], r["kind"] if r["kind"] in known else "") for r in rows]

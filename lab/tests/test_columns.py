@@ -43,7 +43,7 @@ def junction(name, offset, rng, number=40):
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["left", "right"]))
-def test_the_mirrored_recording_reads_alike(seed, side):
+def test_the_mirrored_recording_has_the_same_statistics(seed, side):
     rows, swapped = columns(seed), COLUMNS.index("bearing")
     mirrored = rows.copy()
     mirrored[:, :2], mirrored[:, swapped] = rows[:, [1, 0]], -rows[:, swapped]
@@ -67,7 +67,7 @@ def test_a_gain_changes_no_statistic(seed, nats, side):
         np.testing.assert_allclose(values, two.statistics[name], atol=1e-9)
 
 
-def test_statistics_are_those_of_the_hop_they_name():
+def test_statistics_are_those_of_their_hops():
     """A ramp in every column: its value at T0 - t, its change, and none in rejected hops."""
     rows = np.tile(TIME_S[:, None], len(COLUMNS))
     rows[(TIME_S > 4.95) & (TIME_S < 5.05)] = np.nan
@@ -107,7 +107,7 @@ def two_sets(rng, offset):
     return real, junction("SA1", offset, rng)
 
 
-def test_a_stream_is_cut_where_one_vehicle_comes_alone():
+def test_a_stream_is_cut_at_approaches_of_a_single_vehicle():
     vehicles = (("left", 20.0), ("right", 35.0), ("left", 39.0), ("right", 60.0))
     heard = stream(vehicles, 0)
     found = stream_excerpts(heard, columns(0, len(heard.hops)))

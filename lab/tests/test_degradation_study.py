@@ -90,7 +90,7 @@ def render(log):
 
 @pytest.mark.parametrize("reduced", [3.025, 4.0])
 @pytest.mark.parametrize("family", FAMILIES)
-def test_a_reduced_frame_comes_out_as_if_reduced_afterwards(family, reduced):
+def test_a_degraded_reduced_frame_equals_a_reduced_degraded_frame(family, reduced):
     """Mean and spread of dark and bright patches, in which clipping changes both."""
     grey, rng = next(street(1)), np.random.default_rng(2)
     height, width = grey.shape[:2]
@@ -144,7 +144,7 @@ def test_the_clean_camera_reports_what_the_detector_itself_does(video, looks):
 
 
 @pytest.mark.long
-def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
+def test_a_camera_with_health_estimation_reports_the_same(video, looks, rates):
     first = SimpleNamespace(frames=lambda: islice(video.frames(), 90), frame_rate_hz=10.0, path="first")
     found, d = seen_in(first, MotionDetector(), rates)
     kept = detections_in(looks["mog2"], CLEAN)
@@ -154,7 +154,7 @@ def test_a_watched_camera_reports_and_reads_the_same(video, looks, rates):
     assert seen_in(first, MotionDetector(), replace(rates, health=None))[1](0) == 0.0
 
 
-def test_d_is_read_from_the_images_alone(looks, rates):
+def test_d_is_estimated_from_the_images_alone(looks, rates):
     levels = {
         state.name: np.median(degradation_in(looks[READINGS], state.name, rates).degradation)
         for state in STAGED
@@ -210,7 +210,7 @@ def test_counts_are_those_of_measure_absence(approach, video):
 
 
 @pytest.mark.long
-def test_the_camera_fails_and_beta_knows_while_the_sound_stays(approach, looks, rates):
+def test_beta_rises_with_a_failing_camera_while_the_sound_is_unchanged(approach, looks, rates):
     source, seed = open_source(approach.folder), (0, 1)
     behind = cameras(MOTION, {"mog2": rates}, looks)
     loud = Condition("lens", 4), Condition("roof", 3), Condition("rain", 4)
@@ -254,7 +254,9 @@ def assert_the_sound_says_the_same(source, off):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(approach, video, rates, tmp_path):
+def test_the_chain_estimates_the_cameras_health_from_the_video_beside_the_sound(
+    approach, video, rates, tmp_path
+):
     folder = tmp_path / "recording"
     shutil.copytree(approach.folder, folder)
     writer = cv2.VideoWriter(str(folder / VIDEO_NAME), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
@@ -280,7 +282,7 @@ def test_the_chain_reads_the_cameras_health_from_the_video_beside_the_sound(appr
 
 
 @pytest.mark.long
-def test_a_degraded_camera_misses_what_its_table_says_and_never_less():
+def test_a_degraded_camera_misses_at_the_rate_of_its_table_and_never_less():
     box = DetectionFrame(np.array([[900.0, 500.0, 1000.0, 600.0]]), np.array([0.9]), ("car",))
     log, table = DetectionLog.at_rate([box] * 2000, 10.0), default_miss_rates()
     left = {
@@ -298,7 +300,7 @@ def test_a_degraded_camera_misses_what_its_table_says_and_never_less():
     assert not (left[1.0] > left[0.5]).any()
 
 
-def test_advisories_of_a_state_stand_beside_those_of_the_clean_camera():
+def test_advisories_of_a_state_are_compared_with_those_of_the_clean_camera():
     hops = 6000
     onsets = dict.fromkeys((state.name for state in STATES), range(0, hops, 600))
     onsets["lens 1"], onsets["off"] = range(0, hops, 300), ()
@@ -338,7 +340,7 @@ def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
 
 
 @pytest.mark.long
-def test_rain_on_the_roof_is_white_and_its_own_at_every_microphone(approach):
+def test_rain_on_the_roof_is_white_and_independent_at_every_microphone(approach):
     source = open_source(approach.folder)
     with open_sound(source.sound) as audio:
         dry = np.concatenate(list(audio.blocks()))
@@ -410,13 +412,13 @@ def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):
     assert [row.condition.level for row in sweep.family("noise")] == [0, 1, 2, 3, 4]
 
 
-def test_settings_that_cannot_be_are_refused():
+def test_impossible_settings_are_rejected():
     with pytest.raises(InvalidArgumentError, match="unique names"):
         DegradationSettings(detectors=(*MOTION, *MOTION))
 
 
 @pytest.mark.slow
-def test_the_study_end_to_end_again_from_what_it_kept_and_without_a_broken_recording(tmp_path):
+def test_the_study_end_to_end_then_from_its_cache_and_without_a_broken_recording(tmp_path):
     """Three short approaches and two short empty streets; the second run opens no video."""
     root = tmp_path / "sim"
     assert main(["simulate", "--out", str(root), "--static", "5", "--duration", "3", "--video"]) == 0

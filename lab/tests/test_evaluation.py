@@ -122,7 +122,7 @@ def figures(method, trials: Sequence[Trial]) -> dict[str, float]:
     return Score.of(trials, [asked(method, trials)]).figures()
 
 
-def test_rules_on_posteriors_with_a_known_answer(streets):
+def test_rules_on_posteriors_with_known_results(streets):
     at_once, held = figures(PUBLISHED, streets), figures(SUSTAINED, streets)
     assert at_once["detection"] == held["detection"] == 1.0
     assert at_once["lead_s"] == pytest.approx(2.0)
@@ -151,7 +151,7 @@ STREETS = st.lists(
 
 @settings(max_examples=40)
 @given(kinds=STREETS, minutes=st.integers(0, 9), seed=st.integers(0, 99))
-def test_what_calibrates_is_not_tested(kinds, minutes, seed):
+def test_calibration_recordings_are_not_tested(kinds, minutes, seed):
     """Every recording is tested once; a left-out junction occurs in no calibration set."""
     trials = [made_up(f"r{i}", label, hops=3, site=site) for i, (site, label) in enumerate(kinds)]
     trials += [
@@ -179,7 +179,7 @@ def test_what_calibrates_is_not_tested(kinds, minutes, seed):
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS, ids=lambda one: one.name)
-def test_a_protocol_says_what_it_lacks(protocol):
+def test_a_protocol_lists_missing_data(protocol):
     enough = [
         Take(Path(f"{i}"), f"{i}", site, label, 5.0, protocol.moving)
         for i, (site, label) in enumerate(
@@ -192,7 +192,7 @@ def test_a_protocol_says_what_it_lacks(protocol):
 
 
 @pytest.mark.long
-def test_the_same_seed_gives_the_same_answers_and_another_deals_other_folds(streets):
+def test_the_same_seed_gives_the_same_decisions_and_another_seed_other_folds(streets):
     few = [*streets[:2], *streets[10:12]]
     one, again = (
         run_protocol(STATIC, few, [SUSTAINED], Classifiers(None), (1,)).decisions["sustained"][0]
@@ -208,7 +208,7 @@ def test_figures_of_few_recordings_come_with_a_caution(streets):
     assert run.cautions == ("10 hazard-free recordings: figures from fewer than 20 cannot be read",)
 
 
-def test_another_classifier_judges_what_was_heard(streets):
+def test_another_classifier_is_applied_to_the_cached_features(streets):
     """Eq. (6) with the shipped classifier, hop by hop, from the cached features and camera answers."""
     signature = read_model().signature
     features = np.random.default_rng(2).uniform(0.05, 0.4, (HOPS, 60))
@@ -235,7 +235,7 @@ def table_of(trials: Sequence[Trial]) -> FeatureTable:
     return FeatureTable(features, labels, names, sites, names, (None,) * len(names))
 
 
-def test_windows_of_a_tested_recording_are_left_out_or_refused(streets, tmp_path):
+def test_windows_of_a_test_recording_are_left_out_or_rejected(streets, tmp_path):
     write_features(tmp_path / "windows.csv", table_of(streets))
     tested = tuple(Take(tmp_path / t.name, t.name, t.site, t.label, T0_S) for t in streets[3:12])
     kept, said = windows_from_table(tmp_path / "windows.csv", TakeList(tmp_path, tested, (), (), False))
@@ -259,7 +259,7 @@ def test_simulated_training_windows_are_kept_and_are_of_other_recordings(tmp_pat
 
 
 @pytest.mark.long
-def test_another_model_hears_nothing_but_its_own_chain(tmp_path):
+def test_another_model_runs_only_its_own_chain(tmp_path):
     """Results of the front-end come from the cache; only the chain of the other model is run."""
     sound = tmp_path / "quiet.wav"
     rng = np.random.default_rng(0)
@@ -280,7 +280,7 @@ def test_another_model_hears_nothing_but_its_own_chain(tmp_path):
     assert not np.array_equal(heard.hops.shipped, other.hops.shipped)
 
 
-def test_another_model_of_a_moving_ego_hears_its_drives_anew(tmp_path, monkeypatch):
+def test_another_model_of_a_moving_ego_processes_its_drives_again(tmp_path, monkeypatch):
     noise = 0.01 * np.random.default_rng(0).standard_normal((60_000, 56))
     soundfile.write(tmp_path / "quiet.wav", noise, 48_000, subtype="FLOAT")
     write_array_xml(tmp_path / "array.xml", ovad_array())
@@ -298,7 +298,7 @@ def test_another_model_of_a_moving_ego_hears_its_drives_anew(tmp_path, monkeypat
     ("microphones", "rate_hz", "why"),
     [(8, 48_000, "not the array of the model"), (56, 5_500, "got 5500 Hz")],
 )
-def test_a_model_is_not_scored_on_sound_that_it_was_not_made_for(microphones, rate_hz, why, tmp_path):
+def test_a_model_is_not_scored_on_sound_outside_its_domain(microphones, rate_hz, why, tmp_path):
     array = MicrophoneArray(ovad_array().positions_m[:microphones], "roof")
     noise = 0.01 * np.random.default_rng(0).standard_normal((rate_hz * 5 // 4, microphones))
     soundfile.write(tmp_path / "quiet.wav", noise, rate_hz, subtype="FLOAT")
@@ -313,21 +313,21 @@ def test_a_model_is_not_scored_on_sound_that_it_was_not_made_for(microphones, ra
     assert not rows & set(refused)
 
 
-def test_windows_of_another_array_are_refused(streets, tmp_path):
+def test_windows_of_another_array_are_rejected(streets, tmp_path):
     write_array_xml(tmp_path / "array.xml", MicrophoneArray(ovad_array().positions_m[::7], "ring"))
     write_features(tmp_path / "windows.csv", table_of(streets))
     with pytest.raises(OutOfDomainError, match=r"windows of another array.*extract-features"):
         windows_from_table(tmp_path / "windows.csv", TakeList(tmp_path, (), (), (), False))
 
 
-def test_recordings_that_could_not_be_heard_are_named_where_too_few_are_left():
+def test_unreadable_recordings_are_listed_if_too_few_remain():
     takes = tuple(Take(Path(kind), kind, "SA1", kind, 5.0) for kind in ("left", "none"))
     with pytest.raises(InvalidArgumentError, match=r"found 1 .*; not processed: right: cut short"):
         lacking_data(TakeList(Path("streets"), takes, (), (), False), [Failed("right", "cut short")])
 
 
 @pytest.mark.parametrize("last_s", [4.5, 3.2])
-def test_the_pass_is_where_constant_speed_puts_it(last_s):
+def test_the_pass_is_extrapolated_with_constant_speed(last_s):
     """The vehicle crosses the axis at 4 s with 6 m/s at 8 m; the images end after it, or before."""
     time_s = np.arange(1.0, last_s, 0.1)
     azimuth = np.arctan2(6.0 * (4.0 - time_s), 8.0)
@@ -336,7 +336,7 @@ def test_the_pass_is_where_constant_speed_puts_it(last_s):
     assert pass_time_s(truth.replace(time_s=4.0 - time_s)) is None or last_s > 4.0
 
 
-def test_front_end_figures_of_streets_with_a_known_answer(streets):
+def test_front_end_figures_of_streets_with_known_results(streets):
     study = front_end_study(streets, np.random.default_rng(0), draws=40)
     found = study.figures
     assert found["bearing_srp_deg"] == pytest.approx(3.0)
@@ -370,7 +370,7 @@ def test_bearings_of_all_approaches_are_gated_together(streets):
     np.testing.assert_allclose(curve.threshold, [1.2, 2.0])
 
 
-def test_the_method_of_the_documentation_joins_by_one_line(streets):
+def test_the_method_of_the_documentation_is_added_by_one_line(streets):
     page = Path(__file__).resolve().parents[2] / "docs" / "evidence" / "evaluation.md"
     (program,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     names: dict[str, type] = {}

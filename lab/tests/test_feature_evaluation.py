@@ -80,7 +80,7 @@ def refused(capsys, problem, *words):
 
 
 @given(st.integers(0, 1000), st.integers(12, 60))
-def test_folds_never_part_a_recording_and_share_out_every_stratum(seed, recordings):
+def test_folds_never_split_a_recording_and_divide_every_stratum(seed, recordings):
     table = made_up_table(recordings=recordings)
     folds = folds_by_recording(table, np.random.default_rng(seed))
     keys, labels = table.recording_keys, recording_labels(table)
@@ -110,7 +110,7 @@ class Spy(PublishedClassifier):
 
 @pytest.mark.long
 @pytest.mark.parametrize("protocol", ["cv", "lojo"])
-def test_nothing_is_predicted_by_what_it_was_trained_on(protocol):
+def test_no_window_is_predicted_by_a_classifier_trained_on_it(protocol):
     table = made_up_table(recordings=60)
     passes = cross_validate(table, protocol, WindowMethod(Spy), np.random.default_rng(0), alpha=0.1)
     assert set(passes) == {0.0, 1.0}
@@ -120,7 +120,7 @@ def test_nothing_is_predicted_by_what_it_was_trained_on(protocol):
 
 
 @pytest.mark.parametrize("reference", ["run", "cold", "curated"])
-def test_a_threshold_is_set_on_windows_compared_as_those_that_it_is_for(reference):
+def test_a_threshold_is_set_on_windows_with_the_reference_of_its_use(reference):
     made_up = made_up_table(spread=0.5)
     table = replace(made_up, features=np.exp(made_up.features))
     method = methods()[f"ensemble_{reference}"]
@@ -200,7 +200,7 @@ def test_the_same_command_prints_the_same(csv_path, capsys):
 
 
 @pytest.mark.long
-def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_path, capsys):
+def test_train_writes_exactly_its_path_and_leaves_out_listed_recordings(csv_path, tmp_path, capsys):
     ids = tmp_path / "ids.csv"
     ids.write_text("ID\n" + "\n".join(f"none_{n}" for n in (1, 3, 5, 7)) + "\nleft_0\nright_6\n")
     model = tmp_path / "m"
@@ -218,20 +218,20 @@ def test_train_writes_exactly_that_path_and_leaves_out_the_listed(csv_path, tmp_
 
 
 @pytest.mark.long
-def test_what_ships_is_what_train_makes_if_nothing_else_is_asked_for(csv_path, tmp_path):
+def test_the_shipped_model_is_that_of_train_with_its_defaults(csv_path, tmp_path):
     assert command("fit", csv_path, "--out", tmp_path / "m") == 0
     assert type(read_model(tmp_path / "m").signature) is type(read_model(None).signature)
 
 
 @pytest.mark.long
-def test_simulated_windows_are_learned_too_and_the_card_says_so(tmp_path):
+def test_simulated_windows_are_used_in_training_and_listed_in_the_card(tmp_path):
     table = made_up_table(recordings=30)
     real, more = (write_csv(tmp_path / name, table) for name in ("real.csv", "more.csv"))
     assert command("fit", real, "--simulated", more, more, "--out", tmp_path / "m") == 0
     assert f"{2 * len(table)} simulated" in read_model(tmp_path / "m").provenance.classifier
 
 
-def test_a_site_with_one_recording_is_refused(csv_path, tmp_path, capsys):
+def test_a_site_with_one_recording_is_rejected(csv_path, tmp_path, capsys):
     table = made_up_table()
     lonely = table.select((table.environments != "SA1") | (table.recordings == table.recordings[0]))
     refused(
@@ -251,7 +251,7 @@ def test_figures_for_people_show_every_junction(csv_path, capsys):
     assert all(junction in printed for junction in JUNCTIONS)
 
 
-def test_bad_requests_are_refused(csv_path, tmp_path, capsys):
+def test_bad_requests_are_rejected(csv_path, tmp_path, capsys):
     refused(capsys, "dynamic", "windows", csv_path, "--group", "dynamic")
     refused(capsys, "seeds", "windows", csv_path, "--seeds", 0)
     refused(capsys, "alpha", "windows", csv_path, "--alpha", 1.5, "--seeds", 1)

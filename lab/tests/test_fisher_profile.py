@@ -19,7 +19,7 @@ energies = arrays(np.float64, (5, 16), elements=st.floats(-50, 50))
 
 @settings(max_examples=50, deadline=None)
 @given(energies, st.floats(-40, 40))
-def test_shape_forgets_the_level_and_nothing_else(energy, gain):
+def test_shape_removes_the_level_and_nothing_else(energy, gain):
     shape = level_invariant_shape(energy)
     np.testing.assert_allclose(level_invariant_shape(energy + gain), shape, atol=1e-9)
     np.testing.assert_allclose(shape.mean(axis=1), 0.0, atol=1e-9)
@@ -48,7 +48,7 @@ def test_constant_bands():
     np.testing.assert_array_equal(fisher_profile([[1.0, 2.0]] * 2, [[1.0, 3.0]] * 2), [0.0, np.inf])
 
 
-def test_profile_finds_the_band_in_which_vehicles_are_heard():
+def test_profile_finds_the_band_of_vehicle_sound():
     rng = np.random.default_rng(1)
     edges = np.geomspace(50.0, 8000.0, 17)
     heard = (edges[:-1] > 290) & (edges[1:] < 1900)
@@ -73,6 +73,6 @@ def test_profile_finds_the_band_in_which_vehicles_are_heard():
         lambda: discriminative_range_hz([1.0], [1.0, 2.0], share=0.0),
     ],
 )
-def test_bad_input_is_refused(call):
+def test_bad_input_is_rejected(call):
     with pytest.raises(InvalidArgumentError):
         call()

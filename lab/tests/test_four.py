@@ -24,7 +24,7 @@ def late(sound: np.ndarray, by: Sequence[int]) -> np.ndarray:
     return np.stack([sound[start : start + length] for start in by], axis=1)
 
 
-def test_lost_buffers_are_found_and_given_back() -> None:
+def test_lost_buffers_are_found_and_restored() -> None:
     sound = np.random.default_rng(0).standard_normal(3 * RATE)
     # A board has delays of a few samples.
     recorded = late(sound, [2, 0, BUFFER + 1, 2 * BUFFER])
@@ -66,7 +66,7 @@ def test_every_recording_is_counted_once(folder: Path, capsys: pytest.CaptureFix
     assert found["as_recorded"]["by_kind"]["car"]["hops"] - found["by_kind"]["car"]["hops"] in (1, 2)
 
 
-def test_a_folder_without_recordings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_recordings_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "truth.csv").write_text("file,site,side,kind\n")
     assert main(["four", str(tmp_path), "--model", "any.json"]) == 2
     assert "expected recordings" in capsys.readouterr().err

@@ -48,9 +48,7 @@ def test_bad_input(prominence: list[float], error: list[float], message: str) ->
 
 
 @given(pairs=PAIRS, share=st.floats(0.01, 1.0))
-def test_coverage_asked_for_is_kept_and_no_more_than_needed(
-    pairs: list[tuple[float, float]], share: float
-) -> None:
+def test_the_requested_coverage_is_kept_and_no_more(pairs: list[tuple[float, float]], share: float) -> None:
     prominence, error = np.array(pairs).T
     threshold, median = gating_curve(prominence, error).at_coverage(share)
     kept = prominence >= threshold
@@ -72,7 +70,7 @@ def test_the_prominent_share_of_the_checked_bearings_is_counted() -> None:
     assert curve.at_coverage(0.16)[0] == 2.0 and np.degrees(curve.median_error_rad[0]) > np.degrees(0.2)
 
 
-def test_nothing_in_view_is_no_accuracy() -> None:
+def test_without_a_vehicle_in_view_there_is_no_accuracy() -> None:
     checks = HopTable({"prominence": np.array([1.5, 1.2, 1.1]), "error_rad": np.full(3, np.nan)})
     assert isinstance(bearing_curve(checks), NotUsable)
     assert np.isnan(gated_median_deg(checks))

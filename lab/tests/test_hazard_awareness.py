@@ -82,7 +82,7 @@ def found(corpus):
     return judged(corpus)
 
 
-def test_vision_alone_decays_as_one_minus_beta_and_awareness_does_not(found):
+def test_vision_alone_decreases_as_one_minus_beta_and_awareness_does_not(found):
     assert [row.condition.name for row in found.rows] == list(STATES)
     for row in found.rows:
         assert row.vision.value == pytest.approx(1.0 - beta_of(row.condition), abs=0.06)
@@ -123,13 +123,13 @@ def test_false_alarms_keep_the_budget_of_the_clean_recording(found, corpus):
     assert clean.false_awareness <= 0.06
 
 
-def test_false_detections_are_false_awareness_and_none_of_the_vehicle(found, corpus):
+def test_false_detections_are_false_awareness_and_not_awareness_of_the_vehicle(found, corpus):
     raving = judged([changed(one, seen=np.ones(HOPS, bool)) for one in corpus])
     assert [row.awareness for row in raving.rows] == [row.awareness for row in found.rows]
     assert {row.any_detection for row in raving.rows} == {row.false_awareness for row in raving.rows} == {1.0}
 
 
-def test_what_each_sense_covers_for_the_other_is_lost_when_one_cause_takes_both(found):
+def test_a_common_cause_costs_more_than_each_effect_alone(found):
     """Lens or roof alone cost little, because the other sensor remains; together they cost half."""
     harshest = found.common_cause[-1]
     assert harshest.roof.value > 0.9
@@ -143,12 +143,12 @@ def test_what_each_sense_covers_for_the_other_is_lost_when_one_cause_takes_both(
     assert found.row("rain 1").vision == found.row("lens 1").vision
 
 
-def test_where_the_sound_alone_covers_everything_the_causes_add_up(corpus):
+def test_if_the_sound_alone_is_sufficient_the_effects_add_up(corpus):
     deaf = [changed(one, presence=np.where(one[CLEAN].there, 2.0, 0.5)) for one in corpus]
     assert all(cause.optimism == (0.0, 0.0, 0.0) for cause in judged(deaf).common_cause)
 
 
-def test_what_does_not_fit_is_refused(corpus):
+def test_unsuitable_recordings_are_rejected(corpus):
     free = [one for one in corpus if one[CLEAN].hazard_free]
     with pytest.raises(InvalidArgumentError, match="view"):
         judged(free)
@@ -179,7 +179,7 @@ def test_beta_is_misses_over_looks_with_the_spread_over_recordings():
     assert (mixed.overall.high - mixed.overall.low)[:, 0].min() > 0.4
 
 
-def test_a_fall_of_beta_is_named_with_its_size():
+def test_a_decrease_of_beta_is_listed_with_its_size():
     bent = [row[:] for row in RISING]
     for row in bent:
         row[3] = row[2] - 10
@@ -193,7 +193,7 @@ def test_a_fall_of_beta_is_named_with_its_size():
 
 
 @given(st.lists(st.lists(st.integers(0, 40), min_size=5, max_size=5), min_size=4, max_size=4))
-def test_counts_survive_the_table(misses):
+def test_counts_are_preserved_in_the_table(misses):
     assert counts_of(counts_table(counts(misses))) == counts(misses)
 
 
@@ -211,7 +211,7 @@ def recording(root, site, label, number, filmed=True):
     return Recording(folder, folder.name, site, label, 40)
 
 
-def test_recordings_are_chosen_evenly_and_what_is_missing_is_named(tmp_path):
+def test_recordings_are_chosen_evenly_and_missing_ones_are_listed(tmp_path):
     sites, sides = ("SA1", "SA2", "SB1", "SB2", "SB3"), ("left", "right", "none")
     whole = [recording(tmp_path, site, side, n) for site in sites for side in sides for n in range(4)]
     moving = recording(tmp_path, "DA1", "left", 0)

@@ -65,7 +65,7 @@ def test_fano_is_attained_by_the_symmetric_channel_of_any_size(k, share):
 
 
 @given(joints)
-def test_no_detector_errs_less_than_fano_says(joint):
+def test_no_detector_errs_less_than_the_fano_bound(joint):
     entropy, information = entropy_bits(joint.sum(axis=1)), mutual_information_bits(joint)
     best = 1.0 - joint.max(axis=0).sum()
     sharp = sharp_fano_bound(entropy, information, len(joint))
@@ -113,7 +113,7 @@ def test_estimates_agree_with_the_exact_value_of_two_gaussians(distance):
 
 
 @pytest.mark.parametrize("sharpness", [0.3, 3.0])
-def test_a_classifier_that_is_wrongly_sure_keeps_the_bound_below_and_fools_the_plug_in(sharpness):
+def test_an_uncalibrated_classifier_lowers_the_bound_and_biases_the_plug_in(sharpness):
     x, z = gaussian_sample(20_000, 1.5)
     q = exact_posteriors(x, 1.5) ** sharpness
     found = information_from_posteriors(q / q.sum(axis=1, keepdims=True), z)
@@ -148,7 +148,7 @@ def test_with_a_camera_the_bound_is_the_sum_and_never_worse():
     assert (found.with_vision_rad <= np.minimum(found.std_rad, 0.02)).all()
 
 
-def test_what_could_any_detector_reach_on_data():
+def test_bounds_of_any_detector_on_data():
     x, z = gaussian_sample(3000, 1.0, seed=4)
     q = LogisticRegression().fit(x[:1000, None], z[:1000]).predict_proba(x[1000:, None])
     found = reach_on_data(q, z[1000:], np.random.default_rng(0), features=x[1000:, None])
@@ -176,6 +176,6 @@ def test_what_could_any_detector_reach_on_data():
         lambda: reach_of_array(roof_array_56(), [0.0], [500.0], [0.1], 1, vision_std_rad=-1.0),
     ],
 )
-def test_what_cannot_be_is_refused(call):
+def test_impossible_values_are_rejected(call):
     with pytest.raises(InvalidArgumentError):
         call()

@@ -23,7 +23,7 @@ few = settings(max_examples=40)
 
 @given(st.integers(0, 400), st.floats(1e-3, 1e3), st.floats(0.5, 0.999))
 @few
-def test_the_interval_of_a_rate_holds_the_counts_that_are_not_surprising(count, hours, confidence):
+def test_the_interval_of_a_rate_contains_the_likely_counts(count, hours, confidence):
     low, high = poisson_interval(count, hours, confidence)
     tail = (1 - confidence) / 2
     assert poisson.cdf(count, high * hours) == pytest.approx(tail, rel=1e-6)
@@ -36,14 +36,14 @@ def test_a_rate_at_its_upper_bound_gives_so_few_counts_once_in_ten(count, hours)
 
 
 @pytest.mark.parametrize("arguments", [(-1, 1.0), (1, 0.0), (1, 1.0, 1.0)])
-def test_a_rate_without_time_or_of_less_than_nothing_is_refused(arguments):
+def test_a_rate_without_time_or_with_a_negative_count_is_rejected(arguments):
     with pytest.raises(InvalidArgumentError):
         poisson_interval(*arguments)
 
 
 @given(st.lists(st.floats(0, 20), min_size=1, max_size=5), st.integers(0, 30), st.integers(0, 2**32))
 @settings(max_examples=10)
-def test_random_alarms_detect_what_they_do_when_they_are_drawn(windows, alarms, seed):
+def test_the_random_detection_rate_equals_that_of_drawn_alarms(windows, alarms, seed):
     total, draws = sum(windows) + 10.0, 20_000
     ends = np.cumsum(windows)
     onsets = np.random.default_rng(seed).uniform(0, total, (draws, alarms, 1))
@@ -52,7 +52,7 @@ def test_random_alarms_detect_what_they_do_when_they_are_drawn(windows, alarms, 
     assert random_detection(windows, alarms, total) == pytest.approx(hit.mean(), abs=4 * 0.5 / draws**0.5)
 
 
-def test_random_alarms_need_time_that_holds_the_windows():
+def test_random_alarms_need_scored_time_that_contains_the_windows():
     assert np.isnan(random_detection([], 3, 10.0))
     with pytest.raises(InvalidArgumentError, match="windows_s"):
         random_detection([12.0], 3, 10.0)
@@ -69,7 +69,7 @@ def test_draws_keep_the_size_of_every_stratum(strata, seed):
     assert all(strata[j] == strata[i] for row in drawn for i, j in enumerate(row))
 
 
-def test_the_middle_of_the_draws_is_the_percentile_bootstrap():
+def test_the_central_interval_of_the_draws_is_the_percentile_bootstrap():
     values = np.random.default_rng(1).gamma(2.0, size=60)
     drawn = values[stratified_draws(["one"] * 60, np.random.default_rng(2), draws=4000)].mean(axis=1)
     oracle = bootstrap((values,), np.mean, method="percentile", n_resamples=4000, rng=3).confidence_interval
@@ -78,7 +78,7 @@ def test_the_middle_of_the_draws_is_the_percentile_bootstrap():
     assert np.isnan(middle(np.full(3, np.nan))).all()
 
 
-def test_paired_draws_see_a_difference_that_the_spread_of_recordings_hides():
+def test_paired_draws_show_a_difference_smaller_than_the_spread_of_recordings():
     rng = np.random.default_rng(0)
     hard = rng.normal(size=40)
     draws = stratified_draws(["one"] * 40, rng)
@@ -106,7 +106,7 @@ recordings = st.lists(
 
 @given(recordings, st.integers(2, 12), st.integers(0, 2**32))
 @few
-def test_folds_share_out_every_kind_label_and_stratum(made, folds, seed):
+def test_folds_divide_every_kind_label_and_stratum(made, folds, seed):
     labels, groups = zip(*made, strict=True)
     dealt = deal_folds(labels, groups, np.random.default_rng(seed), folds)
     kinds = [label == "none" for label in labels]
@@ -118,7 +118,7 @@ def test_folds_share_out_every_kind_label_and_stratum(made, folds, seed):
             assert np.ptp(counts) <= 1
 
 
-def test_folds_are_drawn_anew_and_say_what_is_missing():
+def test_folds_are_drawn_again_and_errors_state_what_is_missing():
     labels, groups = ["none", "left"] * 20, ["SA1"] * 40
     first, second = (deal_folds(labels, groups, np.random.default_rng(seed)) for seed in (0, 1))
     assert (first != second).any()

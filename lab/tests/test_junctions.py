@@ -42,7 +42,7 @@ def test_every_junction_is_tested_by_the_others(given, capsys) -> None:
     assert fixed["shipped scores .02"] == retrained["shipped scores .02"]
 
 
-def test_one_junction_is_refused(given, tmp_path, capsys) -> None:
+def test_one_junction_is_rejected(given, tmp_path, capsys) -> None:
     folder = write_corner(tmp_path / "corner", np.random.default_rng(0), approaches=1, hazard_free=1)
     assert main([given[0], str(folder), *given[2:]]) == 2
     assert "two junctions" in capsys.readouterr().err

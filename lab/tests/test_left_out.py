@@ -70,7 +70,7 @@ def quick(monkeypatch):
 
 
 @pytest.mark.long
-def test_what_is_learned_does_not_depend_on_the_streams_that_are_left_out(quick, renderer="rays"):
+def test_training_does_not_depend_on_the_left_out_streams(quick, renderer="rays"):
     every, others = streets(1), streets(2)
     own, rng = own_windows(ovad_array(), FEW, None), np.random.default_rng(FEW.seed)
     fit = fit_of(windows_to_learn(ovad_array(), FEW, *own, rng))
@@ -90,7 +90,7 @@ def test_what_is_learned_does_not_depend_on_the_streams_that_are_left_out(quick,
 
 
 @pytest.mark.long
-def test_the_command_judges_each_renderer_by_models_of_the_two_others(quick, monkeypatch, tmp_path):
+def test_the_command_evaluates_each_renderer_with_models_of_the_two_others(quick, monkeypatch, tmp_path):
     fitted, judged = list[set[str]](), dict[str, set[str]]()
     fit_windows, figures, learn = commission.window_model, left_out.renderer_figures, left_out.learn_sequence
 

@@ -31,7 +31,7 @@ def table(tmp_path):
     return tmp_path / "t.csv"
 
 
-def test_no_classifier_beats_the_bound_and_the_array_is_blind_at_endfire(table, tmp_path, capsys):
+def test_no_classifier_beats_the_bound_and_the_array_has_no_bearing_at_endfire(table, tmp_path, capsys):
     figure = tmp_path / "f.png"
     found = told(capsys, "reach", "--features", table, "--method", "baseline", "--figure", figure)
     data, array = found["features"], found["array"]
@@ -45,7 +45,7 @@ def test_no_classifier_beats_the_bound_and_the_array_is_blind_at_endfire(table, 
     assert f"{data['sharp_fano']:.4g}" in capsys.readouterr().out
 
 
-def test_the_figure_is_refused_before_the_work(table, tmp_path, capsys):
+def test_an_unwritable_figure_is_rejected_before_the_work(table, tmp_path, capsys):
     assert main(["reach", "--features", str(table), "--figure", str(tmp_path / "f.xyz")]) == 2
     assert "f.xyz" in capsys.readouterr().err
 

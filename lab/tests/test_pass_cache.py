@@ -49,7 +49,7 @@ def assert_same(first, second):
 
 @settings(max_examples=40, deadline=None)
 @given(named=st.dictionaries(NAMES, tables(), max_size=3))
-def test_named_tables_of_any_columns_come_back_as_they_were(named, tmp_path_factory):
+def test_named_tables_of_any_columns_are_read_back_unchanged(named, tmp_path_factory):
     path = tmp_path_factory.mktemp("named") / "a.npz"
     save_named(path, named)
     assert_same(load_named(path, "tables"), named)
@@ -64,7 +64,7 @@ def some_tables():
     return {"boxes": boxes, "none": HopTable({"label": np.zeros(0, "<U3")})}
 
 
-def test_a_pass_is_made_once_for_each_key(tmp_path):
+def test_a_pass_is_computed_once_for_each_key(tmp_path):
     cache = PassCache(tmp_path / "cache")
     assert_same(cache.tables("sound", {"a": 1}, some_tables), some_tables())
     assert_same(cache.tables("sound", {"a": 1}, never), some_tables())
@@ -80,7 +80,7 @@ def test_a_pass_that_fails_leaves_no_file(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:100], lambda data: bytes(len(data))])
-def test_a_damaged_file_is_made_again_with_a_warning(damage, tmp_path):
+def test_a_damaged_file_is_computed_again_with_a_warning(damage, tmp_path):
     cache = PassCache(tmp_path)
     cache.tables("sound", 1, some_tables)
     [path] = tmp_path.rglob("*.npz")
@@ -90,7 +90,7 @@ def test_a_damaged_file_is_made_again_with_a_warning(damage, tmp_path):
     assert_same(cache.tables("sound", 1, never), some_tables())
 
 
-def test_tables_of_one_kind_are_no_streams_of_a_user(tmp_path):
+def test_tables_of_a_pass_are_not_read_as_streams(tmp_path):
     save_named(tmp_path / "a.npz", some_tables())
     with pytest.raises(InputFileError, match="at least one hop stream"):
         load_streams(tmp_path / "a.npz")
@@ -103,7 +103,7 @@ def recording(folder):
     return folder
 
 
-def test_a_fingerprint_is_of_the_content_and_of_nothing_else(tmp_path):
+def test_a_fingerprint_depends_only_on_the_content(tmp_path):
     memo = tmp_path / "memo"
     one, other = recording(tmp_path / "one"), recording(tmp_path / "other")
     same = fingerprint(one, memo)
@@ -127,7 +127,7 @@ def test_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
     assert fingerprint(place, memo) == before
 
 
-def test_other_content_of_the_same_size_and_time_is_seen(tmp_path):
+def test_other_content_of_the_same_size_and_time_is_detected(tmp_path):
     memo, place = tmp_path / "memo", recording(tmp_path / "one")
     before = fingerprint(place, memo)
     sound = place / "out_multi.wav"
@@ -137,7 +137,7 @@ def test_other_content_of_the_same_size_and_time_is_seen(tmp_path):
     assert fingerprint(place, memo) != before
 
 
-def test_tables_of_another_pass_under_the_name_are_made_again(tmp_path):
+def test_tables_of_another_pass_under_the_name_are_computed_again(tmp_path):
     cache = PassCache(tmp_path)
     cache.tables("sound", 1, some_tables)
     [mine] = tmp_path.rglob("*.npz")
@@ -150,7 +150,7 @@ def test_tables_of_another_pass_under_the_name_are_made_again(tmp_path):
             assert_same(cache.tables("sound", 1, some_tables), some_tables())
 
 
-def test_windows_are_named_by_their_sound_and_not_by_its_place(tmp_path):
+def test_windows_are_identified_by_their_sound_and_not_by_its_path(tmp_path):
     def origin(folder, **changed):
         window = LabelledWindow("1", "left", "SA1", "r", 70, tmp_path / folder / "out_multi.wav", 3.0)
         return windows_origin([replace(window, **changed)], ovad_array(), tmp_path / "memo")
@@ -164,7 +164,7 @@ def test_windows_are_named_by_their_sound_and_not_by_its_place(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"out_multi.wav": "0"}', "\xff"])
-def test_a_damaged_memory_costs_a_reading(damage, tmp_path):
+def test_a_damaged_memo_only_causes_another_read(damage, tmp_path):
     memo, place = tmp_path / "memo", recording(tmp_path / "one")
     before = fingerprint(place, memo)
     [path] = memo.iterdir()
@@ -172,7 +172,7 @@ def test_a_damaged_memory_costs_a_reading(damage, tmp_path):
     assert fingerprint(place, memo) == before
 
 
-def test_a_single_sound_file_has_a_fingerprint_and_nothing_has_none(tmp_path):
+def test_a_sound_file_has_a_fingerprint_and_a_missing_one_has_none(tmp_path):
     memo = tmp_path / "memo"
     (tmp_path / "a.wav").write_text("sound")
     assert len(fingerprint(tmp_path / "a.wav", memo)) == 32

@@ -121,7 +121,7 @@ def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
 
 
 @pytest.mark.long
-def test_a_vehicle_is_warned_of_keeps_its_identity_and_raises_nothing_once_it_is_seen() -> None:
+def test_a_vehicle_raises_an_advisory_only_before_it_is_seen_and_keeps_its_identity() -> None:
     made_up = stream([("left", "left", 12.0), ("right", "right", 26.0), ("from_ahead", "left", 40.0)])
     follow = followed(WorldFilter(Context()), heard(made_up))
     told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
@@ -135,7 +135,7 @@ def test_a_vehicle_is_warned_of_keeps_its_identity_and_raises_nothing_once_it_is
 
 
 @pytest.mark.long
-def test_two_that_come_at_once_are_two_and_a_car_ahead_is_neither() -> None:
+def test_two_simultaneous_vehicles_are_two_entities_and_a_car_ahead_is_neither() -> None:
     made_up = stream([("both", "left", 15.0), ("both", "right", 15.8), ("from_ahead", "left", 9.5)])
     follow = followed(WorldFilter(Context()), heard(made_up))
     told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
@@ -143,7 +143,7 @@ def test_two_that_come_at_once_are_two_and_a_car_ahead_is_neither() -> None:
     assert (told["identity_kept"], told["took_hidden_identity"]) == (1.0, 0.0)
 
 
-def test_of_a_street_where_nobody_comes_what_cannot_be_told_is_none() -> None:
+def test_undefined_figures_of_a_street_without_approaches_are_none() -> None:
     made_up = stream([("from_ahead", "left", 12.0)], duration_s=30.0)
     follow = followed(WorldFilter(Context()), heard(made_up))
     told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
@@ -167,7 +167,7 @@ def stated(made_up: HeardStream, chance: float, *, masked: bool = False) -> Pass
     return PassedStream(made_up, stream_truth(made_up), follow)
 
 
-def test_one_that_comes_is_ranked_above_one_that_drives_off_and_a_sure_chance_is_counted() -> None:
+def test_an_approaching_vehicle_ranks_above_a_leaving_one_and_certain_chances_are_counted() -> None:
     made_up = stream([("left", "left", 15.0), ("leaves", "right", 40.0)])
     made_up.vehicles.hazard[1], made_up.vehicles.entry_s[1] = False, np.nan
     made_up.rows.in_view[made_up.rows.vehicle == 1] = False
@@ -189,7 +189,7 @@ def test_one_that_comes_is_ranked_above_one_that_drives_off_and_a_sure_chance_is
     assert figures["certain_said"] == 1.0
 
 
-def test_second_vehicles_are_judged_at_the_odds_of_the_street() -> None:
+def test_second_vehicles_are_scored_at_the_base_rate_of_the_street() -> None:
     """One of three vehicles is followed by one from the other side: a chance of one third has no loss."""
     group = "other, 1.5 to 4 s"
     told = second_figures([stated(stream(PAIR + SINGLES), 1.0 / 3.0, masked=True)])
@@ -206,7 +206,7 @@ def test_second_vehicles_are_judged_at_the_odds_of_the_street() -> None:
     assert (told[f"{group}: ECE"], told[f"{group}: said masked"]) == pytest.approx((1.0 / 3.0, 0.0))
 
 
-def test_a_lower_risk_names_more_sides_of_two_and_more_wrong_ones() -> None:
+def test_a_lower_threshold_announces_more_right_and_more_wrong_sides() -> None:
     made_up = stream([*PAIR, *SINGLES, ("both", "left", 56.0), ("both", "right", 57.0)], duration_s=75.0)
     told = stated(made_up, 0.0)
     risk = np.where(told.truth.coming_s <= 8.0, 0.6, 0.15)
@@ -239,7 +239,7 @@ def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
     assert second_figures([merged])[f"{group}: merged"] == 1.0
 
 
-def test_what_a_vehicle_adds_is_its_power_over_all_others() -> None:
+def test_the_added_level_is_the_power_relative_to_all_others() -> None:
     made_up = stream(PAIR, band_db=[60.0, 63.0])
     background_db = 10.0 * math.log10(np.mean(10.0 ** (level_db(made_up)[10:] / 10.0)))
     assert background_db == pytest.approx(40.0 + 10.0 * math.log10(1.7 / 3.0), abs=0.5)
@@ -252,7 +252,7 @@ def test_what_a_vehicle_adds_is_its_power_over_all_others() -> None:
     assert median["other, 1.5 to 4 s (1)"] == pytest.approx(expected[1], abs=0.05)
 
 
-def test_the_meter_reads_decibels_above_the_place_as_it_was() -> None:
+def test_the_meter_measures_decibels_above_the_earlier_level() -> None:
     made_up = stream([("left", "left", 12.0)])
     louder = made_up.hops.middle.copy()
     louder[300:320] *= 10
@@ -275,7 +275,7 @@ def test_the_worst_junction_is_the_worst_of_those_with_eight_cases() -> None:
 
 @given(seed=st.integers(0, 2**32))
 @settings(max_examples=20)
-def test_a_scenario_counts_approaches_and_what_is_unheard_in_gusts_and_outside(seed: int) -> None:
+def test_a_scenario_counts_approaches_and_inaudible_hops_in_gusts_and_outside(seed: int) -> None:
     rng, streams = np.random.default_rng(seed), []
     for vehicles in ([("left", "left", 15.0), ("right", "right", 40.0)], [("from_ahead", "left", 20.0)]):
         passed = stated(stream(vehicles), 0.1)
@@ -311,7 +311,7 @@ def test_the_hops_of_gusts_are_those_in_which_the_wind_is_loud(tmp_path: Path) -
     assert (power[in_gust][:, None] > power[~in_gust]).mean() > 0.8
 
 
-def test_the_guard_speaks_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
+def test_the_guard_acts_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
     """A guard that classifies everything as foreign reduces evidence and `heard`, as in `AcousticAdapter`."""
     made_up, rng = stream([("left", "left", 12.0)], duration_s=16.0), np.random.default_rng(1)
     n = len(made_up.hops)
@@ -342,7 +342,7 @@ def test_the_guard_speaks_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
         assert other.heard == beside_foreign(other.domain, one.heard)
 
 
-def test_boxes_stand_where_the_truth_has_a_vehicle_in_view() -> None:
+def test_boxes_are_at_the_true_positions_of_vehicles_in_view() -> None:
     made_up = stream([("left", "left", 12.0)])
     log = stream_detections(made_up, np.random.default_rng(1))
     boxed_s = log.stamps_ns[[len(frame) > 0 for frame in log.frames]] * 1e-9
@@ -354,7 +354,7 @@ def test_boxes_stand_where_the_truth_has_a_vehicle_in_view() -> None:
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.2))
 @settings(max_examples=10)
-def test_a_hidden_bearing_lies_behind_the_edge_and_is_mirrored(seed: int, edge_rad: float) -> None:
+def test_a_hidden_bearing_is_behind_the_edge_and_is_mirrored(seed: int, edge_rad: float) -> None:
     coming = np.random.default_rng(seed).dirichlet(np.ones(len(COMING_S)))
     sides = [SideGeometry("left", s * edge_rad, s * 1.2, 0.35) for s in (1.0, -1.0)]
     (left, std), (right, same) = (hidden_bearing(coming, side) for side in sides)
@@ -380,7 +380,7 @@ def test_a_known_edge_narrows_the_bearing_and_keeps_the_errors_of_the_time(edge_
     assert variance(edge_deg) - variance(5.0) == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_boxes() -> None:
+def test_no_estimate_costs_half_the_cutoff_and_trackers_follow_the_boxes() -> None:
     pytest.importorskip("stonesoup", reason="the benchmark's trackers: pip install 'worldstate[oracles]'")
     import worldstate_lab.cli.bench.gospa as bench
 
@@ -400,7 +400,7 @@ def test_the_benchmark_charges_silence_half_the_cutoff_and_trackers_follow_the_b
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
-def test_every_snapshot_of_a_stream_holds_to_the_laws(seed: int, tmp_path: Path) -> None:
+def test_every_snapshot_of_a_stream_obeys_the_laws(seed: int, tmp_path: Path) -> None:
     """Fifteen minutes each, two hours together."""
     streets = [junction_named(name) for name in ("SA1", "SA2", "SB1", "SB2")]
     settings = StreamSettings(streets[seed % 4], 15.0, seed, traffic_named("pairs"), sample_rate_hz=6000.0)

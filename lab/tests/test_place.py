@@ -55,7 +55,7 @@ def test_a_reflection_is_the_shortest_way_by_its_wall(
     assert path.azimuth_rad[0] == pytest.approx(np.arctan2(met[1], met[0]), abs=1e-4)
 
 
-def test_who_is_out_of_sight_is_heard_from_the_near_corner() -> None:
+def test_sound_of_a_hidden_vehicle_arrives_from_the_near_corner() -> None:
     direct = sound_paths(MODEL.walls, 7.15, np.array([-20.0, -4.6, 4.6, 20.0]), HZ)[0]
     corner = np.arctan2(2.8, 4.45)
     assert direct.azimuth_rad == pytest.approx([-corner, -corner, corner, corner])
@@ -66,7 +66,7 @@ def test_who_is_out_of_sight_is_heard_from_the_near_corner() -> None:
 
 @given(st.floats(1e-6, 1e6), st.floats(-1e3, 1e3), st.integers(0, 2**32 - 1))
 @settings(max_examples=20, deadline=None)
-def test_scale_and_offset_of_a_spectrum_say_nothing(scale: float, offset: float, seed: int) -> None:
+def test_scale_and_offset_of_a_spectrum_have_no_effect(scale: float, offset: float, seed: int) -> None:
     spectrum = np.random.default_rng(seed).normal(size=len(AZIMUTHS))
     like, nobody = MODEL.log_likelihood(spectrum)
     again, _ = MODEL.log_likelihood(scale * (spectrum + offset))
@@ -93,7 +93,7 @@ def test_a_vehicle_in_view_is_where_its_bearing_meets_the_lane() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.zeros(61), np.zeros(60), np.full(61, np.nan)])
-def test_a_spectrum_that_says_nothing_is_refused(bad: np.ndarray) -> None:
+def test_a_constant_spectrum_is_rejected(bad: np.ndarray) -> None:
     with pytest.raises(InvalidArgumentError, match="spectrum"):
         MODEL.log_likelihood(bad)
 
@@ -120,7 +120,7 @@ def test_a_prediction_moves_the_mean_by_its_speed() -> None:
     assert PLACES.estimate(at_once).mean_m == pytest.approx(-1.0, abs=0.05)
 
 
-def test_what_is_passed_on_completes_what_was_known() -> None:
+def test_the_added_position_completes_the_prior_belief() -> None:
     belief = carried = PLACES.unknown
     for _ in range(10):
         belief = PLACES.update(PLACES.predict(belief, 0.1), plane_waves(-62.0, 32.0))
@@ -139,7 +139,7 @@ def test_what_is_passed_on_completes_what_was_known() -> None:
     assert added_position(before, before, MODEL.walls.crossing_m) is None
 
 
-def test_the_example_gives_an_entity_its_place() -> None:
+def test_the_example_gives_an_entity_its_position() -> None:
     example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "examples" / "place.py"))
     (car,) = example["behind_the_corner"](25).entities
     assert car.status == "hidden" and car.direction == "left"
@@ -147,7 +147,7 @@ def test_the_example_gives_an_entity_its_place() -> None:
 
 
 @pytest.mark.slow
-def test_a_simulated_pass_is_followed_round_the_corner() -> None:
+def test_a_simulated_pass_is_tracked_around_the_corner() -> None:
     models = place_models()
     for seed, site in enumerate(WALLS):
         _, table = simulated_pass(site, np.random.default_rng([9, seed]))

@@ -71,7 +71,7 @@ EVERY = (stream(), stream("SA1"), stream(entries_s=()))
 
 @pytest.mark.long
 @pytest.mark.parametrize("ego", [EgoVehicle(), FROM_STANDING])
-def test_who_knows_brakes_for_vehicles_alone_and_who_knows_nothing_hits_them(ego: EgoVehicle) -> None:
+def test_an_informed_planner_brakes_only_for_vehicles_and_an_uninformed_one_collides(ego: EgoVehicle) -> None:
     corners = draw_corners(EVERY, 40, ego, np.random.default_rng(1))
     planners = every_planner(corners, 0.5, 0.5, ego)
     figures = planner_figures(corners, planners, np.random.default_rng(2))
@@ -114,14 +114,14 @@ def test_no_unseen_vehicle_within_the_limit_is_nearer_than_memory_allows(
     assert (tight >= sight_m - 1e-9).all()
 
 
-def test_memory_of_a_view_that_a_lorry_shuts_ends_when_a_vehicle_can_have_come_so_far() -> None:
+def test_memory_of_a_blocked_view_ends_when_a_vehicle_could_have_arrived() -> None:
     # 40 m visible, then 5 m: at 7 m/s the 35 m between take five seconds.
     time_s = np.arange(0.0, 8.0, 0.05)
     nearest = remembered(np.where(time_s == 0.0, 40.0, 5.0), 7.0 * 0.05)
     np.testing.assert_allclose(nearest, np.maximum(40.0 - 7.0 * time_s, 5.0), atol=1e-9)
 
 
-def test_a_chance_that_says_nothing_of_those_who_come_is_not_trusted() -> None:
+def test_an_uninformative_chance_is_not_used() -> None:
     ego, rng = EgoVehicle(), np.random.default_rng(3)
     knowing = draw_corners(EVERY, 20, ego, rng)
     unheard = draw_corners([stream(known=False), EVERY[2]], 20, ego, rng)
@@ -137,7 +137,7 @@ def with_within(encounters: Encounters, within: np.ndarray) -> Encounters:
 
 @settings(max_examples=4, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.95))
-def test_whatever_is_said_no_car_brakes_or_accelerates_beyond_its_limits(seed: int, threshold: float) -> None:
+def test_no_car_brakes_or_accelerates_beyond_its_limits(seed: int, threshold: float) -> None:
     ego, rng = EgoVehicle(), np.random.default_rng(seed)
     corners = draw_corners(EVERY, 8, ego, rng)
     told = with_within(corners.loud, rng.random((8, corners.loud.within.shape[1], 2, 4)))
@@ -151,7 +151,7 @@ def test_whatever_is_said_no_car_brakes_or_accelerates_beyond_its_limits(seed: i
     np.testing.assert_array_equal(always.front_m, drive_through(corners.loud, 0.0, ego).front_m)
 
 
-def test_streams_without_what_is_asked_for_are_refused() -> None:
+def test_streams_without_the_requested_encounters_are_rejected() -> None:
     with pytest.raises(InvalidArgumentError, match="60 replays of approaches"):
         draw_corners([EVERY[2]], 60, EgoVehicle(), np.random.default_rng(0))
     with pytest.raises(InvalidArgumentError, match="60 times without vehicles"):

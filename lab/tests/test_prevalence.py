@@ -37,12 +37,12 @@ def test_the_mean_is_that_of_the_other_recordings():
 
 
 @pytest.mark.parametrize("risk", [[0.1, 1.1], [0.1, np.nan], [0.1], [-0.1, 0.5]])
-def test_what_is_no_risk_is_refused(risk):
+def test_invalid_risks_are_rejected(risk):
     with pytest.raises(InvalidArgumentError, match="risk"):
         matched_risk(risk, table(["a", "b"], ["DA1"] * 2), 0.5)
 
 
-def test_a_site_with_one_recording_and_an_impossible_mean_are_refused():
+def test_a_site_with_one_recording_and_an_impossible_mean_are_rejected():
     with pytest.raises(InvalidArgumentError, match="DA1/a"):
         matched_risk([0.5, 0.5], table(["a", "a"], ["DA1"] * 2), 0.5)
     with pytest.raises(InvalidArgumentError, match="mean_risk"):

@@ -94,7 +94,7 @@ def test_any_pairs_give_a_distribution(values):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_coupling_minimises_what_it_says(seed):
+def test_coupling_minimises_its_criterion(seed):
     pairs = np.random.default_rng(seed).uniform(0.02, 0.98, 6)
 
     def disagreement(p):
@@ -144,26 +144,26 @@ def test_the_same_seed_gives_the_same_model():
     assert encode(first) == encode(second)
 
 
-def test_a_model_reads_back_to_the_bit(trained):
+def test_a_saved_model_is_read_back_bit_for_bit(trained):
     X, _, model = trained
     again = decode(SignatureModel, encode(model), "file")
     np.testing.assert_array_equal(again.predict_proba(X), model.predict_proba(X))
 
 
-def test_features_that_never_change_do_no_harm():
+def test_constant_features_are_harmless():
     X, y = windows(np.random.default_rng(6))
     X[:, 5] = X[:, 24] = 0.3
     assert np.isfinite(PublishedClassifier(np.random.default_rng(0)).fit(X, y).predict_proba(X)).all()
 
 
-def test_likelihoods_stay_finite_far_from_all_that_was_seen():
+def test_likelihoods_are_finite_far_from_the_training_data():
     model = read_model().signature
     for level in (-1e6, 0.0, 1.0, 1e6):
         assert np.isfinite(model.evidence(np.full(60, level)).log_likelihoods).all()
 
 
 @pytest.mark.parametrize("X", [np.zeros((3, 59)), np.zeros(60), np.full((1, 60), np.nan)])
-def test_other_features_are_refused(X):
+def test_other_features_are_rejected(X):
     with pytest.raises(InvalidArgumentError, match="X"):
         read_model().signature.predict_proba(X)
 

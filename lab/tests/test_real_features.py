@@ -29,7 +29,7 @@ def evaluated(group, protocol, seeds):
     return report(table, [cross_validate(table, protocol, published, rng, alpha=0.02) for rng in generators])
 
 
-def test_the_table_is_what_was_counted():
+def test_the_table_has_the_known_counts():
     table = read_features(FOLDER / TABLE)
     assert len(table) == 909
     assert len(np.unique(table.recording_keys)) == 601
@@ -38,7 +38,7 @@ def test_the_table_is_what_was_counted():
 
 
 @pytest.mark.long
-def test_static_cross_validation_reaches_what_was_published():
+def test_static_cross_validation_reaches_the_published_figures():
     figures = evaluated("static", "cv", seeds=2)
     assert 0.91 <= figures["accuracy"] <= 0.93
     assert figures["auroc_pooled"] == pytest.approx(0.976, abs=0.006)
@@ -66,7 +66,7 @@ def test_a_moving_ego_is_harder_still():
     assert figures["accuracy"] == pytest.approx(0.77, abs=0.03)
 
 
-def test_the_model_that_ships_has_learned_no_recording_of_the_official_lists():
+def test_the_shipped_model_is_not_trained_on_the_official_lists():
     table = read_features(FOLDER / TABLE).group("static")
     excluded = [name for file in LISTS for name in read_ids(FOLDER / file)]
     shipped = read_model()
@@ -77,7 +77,7 @@ def test_the_model_that_ships_has_learned_no_recording_of_the_official_lists():
         check_unseen(shipped, table.without(excluded))
 
 
-def test_the_model_that_ships_holds_on_the_official_test_recordings():
+def test_the_shipped_model_keeps_its_figures_on_the_official_test_recordings():
     table = read_features(FOLDER / TABLE).group("static").only(read_ids(FOLDER / LISTS[0]))
     figures = report(
         table, [predict_held_out(read_model(), table, 0.02, "curated", np.random.default_rng(0))]

@@ -57,7 +57,7 @@ def test_a_moving_ego_at_a_junction_never_seen():
 
 
 @pytest.mark.slow
-def test_what_a_stream_brings_lies_between_nothing_and_the_curated_windows():
+def test_a_learned_reference_is_between_none_and_curated_windows():
     # With a moving ego, the level is informative only at known junctions; three passes, one table.
     table = read_features(TABLE).group("dynamic")
     rows = [row_of("worldstate", "lojo", reference) for reference in ("cold", "run", "curated")]
@@ -86,7 +86,7 @@ def test_from_a_standing_to_a_moving_ego():
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["lojo", "cv", "transfer"])
 @pytest.mark.parametrize("row", ["baseline", "baseline_absent", "loudest_direction"])
-def test_a_moving_ego_gains_on_every_other_row(protocol, row):
+def test_a_moving_ego_improves_on_every_other_row(protocol, row):
     figures = compared("dynamic", protocol, ("baseline", "loudest_direction"))
     assert figures["gains"][row]["auroc_pooled"]["gain"] > 0
     assert figures["gains"][row]["brier"]["gain"] < 0
@@ -97,7 +97,7 @@ def command(*words):
 
 
 @pytest.mark.slow
-def test_the_command_prints_every_row_and_writes_what_it_scored(tmp_path, capsys):
+def test_the_command_prints_every_row_and_writes_its_predictions(tmp_path, capsys):
     out = tmp_path / "p.csv"
     words = ("--group", "dynamic", "--protocol", "transfer", "--method", "worldstate", "--seeds", 1)
     assert command(*words, "--json", "--predictions", out) == 0
@@ -123,7 +123,7 @@ def test_the_command_prints_every_row_and_writes_what_it_scored(tmp_path, capsys
 
 
 @pytest.mark.long
-def test_no_row_of_the_data_ships_and_the_official_test_recordings_hold():
+def test_no_row_of_the_data_ships_and_figures_hold_on_the_official_test_recordings():
     table = read_features(TABLE).group("static")
     ids = read_ids(TABLE.parent / "timeHorizonStaticTestset.csv")
     settings = TrainingSettings(repeats=1)

@@ -60,7 +60,7 @@ def row(found: Realism, figure: str, of: str):
     return next(one for one in found.rows if (one.figure, one.windows) == (figure, of))
 
 
-def test_sets_of_one_kind_cannot_be_told_apart():
+def test_sets_of_one_kind_cannot_be_separated():
     rng = np.random.default_rng(1)
     one = windows(rng)
     areas = [two_sample_area(one, other, rng) for other in (windows(rng), windows(rng, scale=2.0))]
@@ -68,7 +68,7 @@ def test_sets_of_one_kind_cannot_be_told_apart():
     assert areas[1] > 0.9
 
 
-def test_what_real_junctions_are_to_one_another_is_inside():
+def test_differences_between_real_junctions_are_inside():
     rng = np.random.default_rng(1)
     sets = {"alike": windows(rng), "louder": windows(rng, scale=2.0)}
     found = measure_realism(windows(rng), sets, rng, classifiers=False)
@@ -105,7 +105,7 @@ def test_the_areas_do_not_depend_on_the_order_of_the_sets():
     assert min(areas.values()) >= 0.5
 
 
-def test_windows_without_a_class_are_compared_by_the_others():
+def test_windows_without_a_class_are_compared_by_the_other_classes():
     table = windows(np.random.default_rng(10))
     found = measure_realism(
         table, {"made": table.select(table.labels != "front")}, np.random.default_rng(0), classifiers=False
@@ -113,7 +113,7 @@ def test_windows_without_a_class_are_compared_by_the_others():
     assert {one.windows for one in found.rows if one.figure.startswith("AUROC")} == {"hidden", "none"}
 
 
-def test_the_side_is_learned_from_other_junctions_and_is_chance_where_labels_are_shuffled():
+def test_side_accuracy_uses_other_junctions_and_is_chance_with_shuffled_labels():
     rng = np.random.default_rng(6)
     table = windows(rng, n=60)
     assert min(side_accuracy(table, table).values()) > 0.9
@@ -150,7 +150,7 @@ def test_the_share_between_sites_is_that_of_their_offsets():
     assert figures["sd of pattern", "none"] == pytest.approx(0.26, abs=0.02)
 
 
-def test_junctions_are_grouped_so_that_both_halves_hold_both_types():
+def test_junctions_are_grouped_so_that_both_halves_contain_both_types():
     assert len(halves(["SA1", "SA2", "SB1", "SB2", "SB3"])) == 6
     assert [str(one) for one in halves(["DA1", "DB1", "DB2"])] == [
         "DA1 | DB1 DB2",
@@ -159,7 +159,7 @@ def test_junctions_are_grouped_so_that_both_halves_hold_both_types():
     ]
 
 
-def test_a_set_without_hazards_is_refused():
+def test_a_set_without_hazards_is_rejected():
     rng = np.random.default_rng(5)
     calm = windows(rng)
     with pytest.raises(InvalidArgumentError, match="seed 1"):
@@ -214,7 +214,7 @@ def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
     assert np.ptp(permuted) < 0.7 * np.ptp(quarter)
 
 
-def test_the_windows_of_a_simulated_approach_are_features_by_right_and_permuted_positions():
+def test_windows_of_a_simulated_approach_have_features_with_correct_and_permuted_positions():
     plan = WindowPlan(0, "SB1", "left", np.random.SeedSequence(3))
     rows = windows_of_recording(preset(), plan)
     assert [row[1:] for row in rows] == [("left", "SB1", "0"), ("front", "SB1", "0")]
@@ -225,7 +225,7 @@ def test_the_windows_of_a_simulated_approach_are_features_by_right_and_permuted_
     assert not np.allclose(permuted, right, rtol=0.01)
 
 
-def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
+def test_windows_have_the_times_of_the_released_program(monkeypatch):
     """They end at T0, one frame later, or half a second later if the ego moves; the front window 1.5 s
     after."""
     ends, entries = {}, []
@@ -255,7 +255,7 @@ def test_windows_lie_where_the_released_program_cuts_them(monkeypatch):
 
 
 @pytest.mark.long
-def test_the_command_holds_given_windows_against_a_table(tmp_path, capsys):
+def test_the_command_compares_given_windows_with_a_table(tmp_path, capsys):
     """With existing windows of some of the junctions, without a simulation."""
     rng = np.random.default_rng(9)
     write_features(tmp_path / "real.csv", windows(rng))
@@ -310,7 +310,7 @@ def test_the_command_simulates_the_junctions_of_a_table(group, sites, tmp_path, 
     assert again["sd of log level", "none"] == {"windows-4": first["sd of log level", "none"]["seed 4"]}
 
 
-def test_a_table_without_the_group_is_refused_before_the_work(tmp_path, capsys):
+def test_a_table_without_the_group_is_rejected_before_the_work(tmp_path, capsys):
     write_features(tmp_path / "real.csv", windows(np.random.default_rng(0), n=2))
     assert main(["realism", str(tmp_path / "real.csv"), "--group", "dynamic"]) == 2
     assert "dynamic" in capsys.readouterr().err

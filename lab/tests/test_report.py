@@ -51,7 +51,7 @@ def small_document(text, draw=plot):
     return Document(text, text, (Section(text, (text,), (table, figure)),), ((text, text),))
 
 
-def test_what_comes_from_outside_is_text_and_never_markup():
+def test_external_text_is_never_markup():
     text = markdown_page(small_document(HOSTILE), "report_files")
     rows = [line for line in text.splitlines() if line.startswith("|")]
     # A bar or a line break in a name would change the number of cells.
@@ -62,20 +62,20 @@ def test_what_comes_from_outside_is_text_and_never_markup():
 
 @settings(max_examples=30)
 @given(st.lists(st.tuples(st.text(max_size=8), st.floats(-1e6, 1e6)), min_size=1, max_size=5))
-def test_csv_gives_every_number_back_to_the_last_bit(rows):
+def test_csv_preserves_every_number_to_the_last_bit(rows):
     table = Table("t", "", ("name", "x"), tuple((name, Value(x, x - 1.0)) for name, x in rows))
     read = list(csv.reader(io.StringIO(table.csv(), newline="")))
     assert read[0] == ["name", "x value", "x low"]
     assert [(float(a), float(b)) for _, a, b in read[1:]] == [(x, x - 1.0) for _, x in rows]
 
 
-def test_a_value_says_why_it_is_missing_and_never_prints_minus_zero():
+def test_a_missing_value_has_a_reason_and_minus_zero_is_never_printed():
     assert Value(math.nan, note="states none").text == "states none"
     assert Value(-0.001, -0.004, 0.1).text == "0.00 [0.00, 0.10]"
     assert Value(1.0, math.nan, 2.0).text == "1.00"
 
 
-def test_a_picture_that_fails_leaves_the_last_report_as_it_was(tmp_path):
+def test_a_failed_picture_leaves_the_last_report_unchanged(tmp_path):
     write_document(small_document("first"), tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
@@ -90,7 +90,7 @@ def test_a_picture_that_fails_leaves_the_last_report_as_it_was(tmp_path):
     ]  # fmt: skip
 
 
-def test_a_file_of_the_user_is_not_taken_for_an_old_report(tmp_path):
+def test_a_file_of_the_user_is_not_mistaken_for_an_old_report(tmp_path):
     (tmp_path / "report_files").write_text("mine")
     with pytest.raises(InputFileError, match="earlier report"):
         write_document(small_document("x"), tmp_path)
@@ -194,7 +194,7 @@ def evaluation(tmp_path_factory):
 
 
 @pytest.mark.long
-def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(evaluation, tmp_path):
+def test_the_report_contains_every_number_of_the_paper_with_the_measured_one(evaluation, tmp_path):
     document = evaluation_document(evaluation, configuration=(("--seed", "7"),))
     blocks = {block.name: block for block in document.blocks}
     assert ("--seed", "7") in document.facts
@@ -218,7 +218,7 @@ def test_the_report_holds_every_number_of_the_paper_beside_what_was_measured(eva
     assert "not run: needs more" in text
 
 
-def test_every_table_says_what_it_stands_on_and_every_mean_its_worst_junction(evaluation, tmp_path):
+def test_every_table_states_its_data_and_every_mean_its_worst_junction(evaluation, tmp_path):
     blocks = {block.name: block for block in evaluation_document(evaluation).blocks}
     hours = 8 * 60 * 0.1 / 3600.0
     told = f"16 recordings: 8 approaches and 8 hazard-free, {hours:.3f} h."
@@ -239,7 +239,7 @@ def test_every_table_says_what_it_stands_on_and_every_mean_its_worst_junction(ev
 
 
 @pytest.mark.long
-def test_a_model_that_was_not_made_for_the_sound_has_rows_without_numbers(evaluation, tmp_path):
+def test_a_model_outside_its_domain_has_rows_without_numbers(evaluation, tmp_path):
     why = "<b>: not the array of the model"
     refused = {"static": {"shipped model": why, "shipped scores .02": why}}
     document = evaluation_document(replace(evaluation, refused=refused))
@@ -254,7 +254,7 @@ def test_a_model_that_was_not_made_for_the_sound_has_rows_without_numbers(evalua
     assert "&lt;b>: not the array of the model" in (tmp_path / "report.md").read_text("utf-8")
 
 
-def test_an_approach_without_video_is_drawn_without_images_and_says_so():
+def test_an_approach_without_video_is_drawn_without_images_and_states_it():
     times = 1.0 + 0.1 * np.arange(20)
     boxes = HopTable({"time_s": np.array([0.5, 2.0, 2.01]), "moving": np.ones(3, bool)})
     said = Decisions.of(times, times > 1.5, score=np.linspace(0, 1, 20), threshold=np.array([0.5]))
@@ -312,7 +312,7 @@ def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation,
     assert "<b>second" not in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 
-def test_results_are_merged_by_the_words_that_change_a_figure(tmp_path, capsys):
+def test_results_are_merged_by_the_arguments_that_change_a_figure(tmp_path, capsys):
     path = tmp_path / "results.json"
     for words in (["bench", "--seed", "3"], ["bench", "--seed", "3", "--jobs", "2"], ["bench", "--smoke"]):
         given = Namespace(seed=3, smoke="--smoke" in words)

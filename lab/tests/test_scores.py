@@ -40,7 +40,7 @@ def windows(trials, answers, column, horizon_s=np.inf):
     return np.concatenate(values), np.concatenate(labels)
 
 
-def test_alarms_that_are_known():
+def test_figures_of_known_alarms():
     trials = [made_up("a", "left", t0_s=7.0), made_up("b", "right", t0_s=7.0), made_up("c"), made_up("d")]
     left = np.ones(81, int)
     answers = [
@@ -95,7 +95,7 @@ def test_stamps_half_a_sample_off_change_nothing():
         assert figures[name] == pytest.approx(value, abs=1e-4, nan_ok=True), name
 
 
-def test_awareness_is_of_alarms_and_of_boxes():
+def test_awareness_counts_alarms_and_boxes():
     trial = made_up("a", "left", t0_s=5.0)
     blind = replace(trial, boxes=made_up("b").boxes)
     calm = made_up("c")
@@ -131,7 +131,7 @@ def test_figures_of_windows_are_those_of_other_formulas():
     assert figures["bearing_gated_deg"] == pytest.approx(np.degrees(gated))
 
 
-def test_a_track_that_is_late_and_changes_its_name():
+def test_a_track_that_is_late_and_changes_its_identity():
     # In view for ten hops, tracked with an error of 5 degrees from the third on, with another identity in the
     # last two.
     trial, calm = made_up("a", "left"), made_up("c")
@@ -162,7 +162,7 @@ def test_a_bearing_without_a_track_counts_while_in_alarm():
     assert np.isnan(figures["track_latency_s"])
 
 
-def test_a_time_to_visible_stands_beside_the_best_constant():
+def test_the_time_to_visible_is_compared_with_the_best_constant():
     trial, calm = made_up("a", "left"), made_up("c")
     true_s = 5.0 - trial.hops.time_s
     stated = np.stack([true_s, true_s + 0.5, true_s + 1.0], axis=1)
@@ -290,7 +290,7 @@ def detector(trials, rate, rng):
 
 
 @pytest.mark.long
-def test_intervals_hold_the_truth_in_most_experiments():
+def test_intervals_contain_the_truth_in_most_experiments():
     rng = np.random.default_rng(7)
     trials = [made_up(f"r{i}", "left", hops=50, site=f"S{i % 2}") for i in range(40)] + [
         made_up("c", hops=50)
@@ -327,7 +327,7 @@ def scored(trial, levels):
     return alarmed(trial, [], score=score)
 
 
-def test_false_alarms_are_compared_where_both_detect_as_much():
+def test_false_alarms_are_compared_at_equal_detection():
     near = [made_up(f"a{i}", "left", t0_s=7.0) for i in range(10)]
     calm = [made_up("c"), made_up("d")]
     trials = [*near, *calm]
@@ -349,7 +349,7 @@ def test_false_alarms_are_compared_where_both_detect_as_much():
     assert not equal_detection(trials, {BASELINE: [theirs]}, draws)
 
 
-def test_sites_stand_beside_the_worst_of_them():
+def test_figures_by_site_include_the_worst_one():
     good, bad = made_up("a", "left", site="SA1"), made_up("b", "left", site="SB1")
     calm = made_up("c", site="SC1")
     score = Score.of([good, bad, calm], [[alarmed(good, [(4.0, 4.2)]), alarmed(bad, []), alarmed(calm, [])]])
@@ -359,7 +359,7 @@ def test_sites_stand_beside_the_worst_of_them():
     assert score.worst_sites()["false_alarms_per_hour"] == ("SC1", 0.0)
 
 
-def test_what_a_method_does_not_state_is_not_there():
+def test_values_that_a_method_does_not_give_are_missing():
     trials = [made_up("a", "left"), made_up("c")]
     score = Score.of(trials, [[alarmed(one, []) for one in trials]])
     figures = score.figures()
@@ -394,7 +394,7 @@ def test_one_kind_of_recordings_alone_has_the_figures_of_its_kind(label):
     score.intervals(stratified_draws(score.draw_strata, rng, 5))
 
 
-def test_answers_that_do_not_fit_are_refused():
+def test_invalid_decisions_are_rejected():
     near, calm = made_up("a", "left"), made_up("c")
     fits = [alarmed(near, []), alarmed(calm, [])]
     for trials, passes, told in [

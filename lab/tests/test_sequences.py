@@ -57,7 +57,7 @@ def draw():
     return np.random.default_rng(0)
 
 
-def test_a_score_that_rises_two_seconds_before_sight_separates_from_there_on() -> None:
+def test_a_score_that_rises_two_seconds_before_t0_separates_from_then_on() -> None:
     trials = corner()
     scores = [before(one, 2.0).astype(float) for one in trials]
     right = [(one.label == "right") * score for one, score in zip(trials, scores, strict=True)]
@@ -70,7 +70,7 @@ def test_a_score_that_rises_two_seconds_before_sight_separates_from_there_on() -
     assert (found["1"]["approaches"], found["1"]["hazard_free"]) == (4, 4)
 
 
-def test_hops_of_hazard_free_recordings_count_as_many_as_they_are() -> None:
+def test_every_hop_of_hazard_free_recordings_counts() -> None:
     trials = corner(2, 2)
     # In a quarter of all hazard-free hops the score equals that of an approach, at the compared hop it does
     # not.
@@ -82,7 +82,7 @@ def test_hops_of_hazard_free_recordings_count_as_many_as_they_are() -> None:
     assert "side_auroc" not in found
 
 
-def test_what_a_cut_start_takes_away_is_not_counted() -> None:
+def test_hops_of_a_cut_start_are_not_counted() -> None:
     whole, cut = (
         leads(one, [x.hops.time_s for x in one], None, draw()) for one in (corner(), corner(start_s=2))
     )
@@ -92,13 +92,13 @@ def test_what_a_cut_start_takes_away_is_not_counted() -> None:
     assert np.isnan(cut["3"]["auroc"])
 
 
-def test_a_recording_that_is_cut_keeps_the_time_before_sight(tmp_path) -> None:
+def test_a_cut_recording_keeps_the_time_before_t0(tmp_path) -> None:
     one = read_recordings(write_corner(tmp_path / "corner", draw()))[0]
     later = one.cut(1.0)
     assert (later.t0_s, later.length_s, later.start_s) == (2.0, 3.0, 1.0)
 
 
-def test_an_alarm_at_the_first_hop_is_an_onset_and_leads_from_there() -> None:
+def test_an_alarm_at_the_first_hop_is_an_onset_with_its_lead() -> None:
     trials = corner(2, 2, t0_s=8.0)
     always = [np.ones(81, bool) for _ in trials]
     row = alarm_row(trials, [always], draw())
@@ -113,7 +113,7 @@ def test_an_alarm_at_the_first_hop_is_an_onset_and_leads_from_there() -> None:
     assert row["interval"][0] < 2 / hours < row["interval"][1]
 
 
-def test_an_alarm_lasts_that_stands_half_a_second_before_sight() -> None:
+def test_a_lasting_alarm_is_on_half_a_second_before_t0() -> None:
     trials = corner(2, 2)
     # Both begin 3 s before T0; the second alarm ends, and begins again too late.
     alarms = [before(trials[0], 3.0), before(trials[1], 3.0, 1.0) | before(trials[1], 0.3)]
@@ -160,7 +160,7 @@ def test_the_sweep_counts_as_the_rows_do() -> None:
         assert row["lead_s_missed_0"] == pytest.approx(swept["lead_s"][i] / 4)
 
 
-def test_chances_are_held_against_the_side_that_something_comes_from() -> None:
+def test_chances_are_compared_with_the_side_of_the_vehicle() -> None:
     trials = corner(2, 2)
 
     def stated(trial, sure):
@@ -179,13 +179,13 @@ def test_chances_are_held_against_the_side_that_something_comes_from() -> None:
     assert calibration(unknown, draw())["ece"] is None
 
 
-def test_a_hop_between_two_belongs_to_none() -> None:
+def test_a_time_between_two_hops_matches_none() -> None:
     trial = corner(1, 0)[0]
     assert trial.hops.time_s[hop_before(trial, 1.5)].tolist() == [3.5]
     assert hop_before(trial, 4.2).size == 0
 
 
-def test_the_tracker_counts_boxes_by_the_filter_that_it_is_given() -> None:
+def test_the_tracker_accepts_boxes_by_its_filter() -> None:
     low = made_up("a", "left")
     boxes = low.boxes.replace(score=np.full(len(low.boxes), 0.4), box_px=low.boxes.box_px * [0, 0, 70, 70])
     trial = replace(low, boxes=boxes)
@@ -223,9 +223,7 @@ def test_the_command_scores_a_made_up_corner(tmp_path, capsys) -> None:
     assert "sequences corner" in json.loads((tmp_path / "results.json").read_text())
 
 
-def test_the_filter_that_ships_is_the_product_and_every_way_of_windows_is_another_one(
-    tmp_path, capsys
-) -> None:
+def test_the_shipped_filter_is_the_product_and_every_use_of_windows_differs(tmp_path, capsys) -> None:
     folder, found = write_corner(tmp_path / "corner", draw()), []
     for words in (["--windows"], []):
         assert main(["sequences", str(folder), "--path", "seven", "--json", *words]) == 0
@@ -264,25 +262,25 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
         (["--start", "9"], "--start"),
     ],
 )
-def test_what_cannot_be_scored_is_refused(tmp_path, capsys, words, problem) -> None:
+def test_recordings_that_cannot_be_scored_are_rejected(tmp_path, capsys, words, problem) -> None:
     folder = write_corner(tmp_path / "corner", draw())
     assert main(["sequences", str(folder), *words]) == 2
     assert problem in capsys.readouterr().err
 
 
-def test_recordings_of_one_kind_are_refused(tmp_path, capsys) -> None:
+def test_recordings_of_one_kind_are_rejected(tmp_path, capsys) -> None:
     assert main(["sequences", str(write_corner(tmp_path / "corner", draw(), hazard_free=0))]) == 2
     assert "found one kind" in capsys.readouterr().err
 
 
-def test_a_folder_that_cannot_be_heard_is_refused_by_its_problem(tmp_path, capsys) -> None:
+def test_an_unreadable_folder_is_rejected_with_its_problem(tmp_path, capsys) -> None:
     folder = write_corner(tmp_path / "corner", draw())
     (folder / "srp.npz").unlink()
     assert main(["sequences", str(folder)]) == 2
     assert "srp.npz" in capsys.readouterr().err
 
 
-def test_the_simulated_exam_stands_beside_what_it_has_a_figure_of(tmp_path) -> None:
+def test_figures_of_the_simulated_exam_are_printed_beside_the_same_real_figures(tmp_path) -> None:
     file = tmp_path / "exam.json"
     file.write_text(json.dumps({"auroc_1s_before": 0.98, "detected": 0.79, "onsets_per_hour": 6.0}))
     exam = exam_figures(file)
@@ -293,7 +291,7 @@ def test_the_simulated_exam_stands_beside_what_it_has_a_figure_of(tmp_path) -> N
     assert "6.00" in last
 
 
-def test_the_card_of_the_model_that_ships_has_what_the_pages_print_and_a_board_has_the_gap_alone(
+def test_the_card_of_the_shipped_model_has_the_figures_of_the_pages_and_a_board_only_a_note(
     tmp_path, capsys
 ) -> None:
     model = read_model()

@@ -102,7 +102,7 @@ def drawn(rng, recordings, clips, *, fingerprint=0.0, lift=0.0):
 
 @settings(max_examples=10, deadline=None)
 @given(st.floats(-40.0, 20.0), st.sampled_from((44_100.0, 32_000.0, 24_000.0)))
-def test_a_tone_lies_in_its_band_at_its_level_whatever_the_sample_rate(level_db, rate_hz):
+def test_a_tone_is_in_its_band_with_its_level_at_any_sample_rate(level_db, rate_hz):
     amplitude, band = 0.1 * 10.0 ** (level_db / 20.0), 9
     edges = signature_edges_hz()
     tone = np.sin(2.0 * np.pi * np.mean(edges[band : band + 2]) * np.arange(2 * rate_hz) / rate_hz)
@@ -111,7 +111,7 @@ def test_a_tone_lies_in_its_band_at_its_level_whatever_the_sample_rate(level_db,
     assert found[band] == pytest.approx(np.log(amplitude**2 / 2.0), abs=0.05)
 
 
-def test_a_recording_is_never_scored_by_a_model_that_learned_it():
+def test_a_recording_is_never_scored_by_a_model_trained_on_it():
     learned, kept = [], []
     for rng in np.random.default_rng(0).spawn(6):
         table = drawn(rng, recordings=14, clips=4, fingerprint=5.0)
@@ -123,7 +123,7 @@ def test_a_recording_is_never_scored_by_a_model_that_learned_it():
     assert how == "5 folds by recording"
 
 
-def test_another_gain_moves_the_threshold_and_not_the_area():
+def test_another_gain_shifts_the_threshold_but_not_the_area():
     rng = np.random.default_rng(2)
     home, away = (drawn(rng, recordings=10, clips=20, lift=3.0) for _ in range(2))
     louder = ClipSignatures.of(
@@ -203,7 +203,7 @@ def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_p
     assert [problem for problem in report["left_out"] if broken.name in problem] == report["left_out"] != []
 
 
-def test_the_rows_of_a_corpus_that_is_not_there_say_what_fills_them(clips):
+def test_rows_of_a_missing_corpus_contain_the_command_that_computes_them(clips):
     city = corpus(clips, CITY_STREET)
     rows = signature_study(None, city, np.random.default_rng(0)).rows
     notes = {row.note for row in rows if row.value is None}
@@ -217,6 +217,6 @@ def test_a_wrong_folder_is_one_line_and_exit_code_two(tmp_path, capsys):
     assert "missing: annotation/idmt_traffic_all.txt" in capsys.readouterr().err
 
 
-def test_without_a_corpus_the_command_says_what_it_needs(capsys):
+def test_without_a_corpus_the_command_lists_its_options(capsys):
     assert main(["corpora"]) == 2
     assert "expected --idmt, --melaudis or both" in capsys.readouterr().err

@@ -102,7 +102,7 @@ def test_a_state_has_the_layout_of_the_clean_boxes_and_is_searched_once(folder, 
     assert stage_recording(staging, recording) == 0
 
 
-def test_nothing_is_left_of_a_search_that_fails(folder, tmp_path):
+def test_a_failed_search_leaves_no_file(folder, tmp_path):
     class Failing(Bright):
         def detect(self, frame):
             found = super().detect(frame)
@@ -115,14 +115,14 @@ def test_nothing_is_left_of_a_search_that_fails(folder, tmp_path):
     assert not [*tmp_path.rglob("*.json")]
 
 
-def test_what_is_staged_depends_on_state_and_image_only(folder, staging, tmp_path):
+def test_staging_depends_on_state_and_image_only(folder, staging, tmp_path):
     recording = read_recordings(folder)[0]
     alone = Staging(tmp_path, "nanodet", Bright, 2, (NOISY,))
     stage_recording(alone, recording)
     assert alone.path(NOISY, recording.name).read_bytes() == staging.path(NOISY, recording.name).read_bytes()
 
 
-def test_least_score_and_height_are_those_that_find_the_vehicle_and_nothing_else(folder):
+def test_minimum_score_and_height_accept_the_vehicle_and_nothing_else(folder):
     watched = [watched_images(one) for one in read_recordings(folder)]
     assert [len(one.images) for one in watched] == [20, 30, 20, 30]
     best = box_choices(watched)[0]
@@ -146,7 +146,7 @@ def test_the_dark_camera_is_not_aware_and_the_clean_one_is(folder, staging):
     assert not [one for one in curves.falls if one.along == "degradation" and one.where.startswith("dark")]
 
 
-def test_the_command_stages_and_prints_what_it_counted(folder, tmp_path, monkeypatch, capsys):
+def test_the_command_stages_and_prints_its_counts(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(staged_video, "opened_nanodet", lambda model: Bright())
     words = ["staged", str(folder), "--out", str(tmp_path / "staged")]
     assert main([*words, "--json"]) == 0
@@ -163,5 +163,5 @@ def test_the_command_stages_and_prints_what_it_counted(folder, tmp_path, monkeyp
     assert "camera alone" in capsys.readouterr().out
 
 
-def test_boxes_that_count_are_named_once():
+def test_the_filter_of_accepted_boxes_is_defined_once():
     assert (NANODET_BOXES.min_score, NANODET_BOXES.min_height_px) == (0.3, 60.0)

@@ -39,7 +39,7 @@ def test_over_a_stream_the_statistic_is_that_of_every_hop(rows):
     assert switched == pytest.approx(alone, rel=1e-9)
 
 
-def test_the_approach_term_moves_the_log_odds_by_its_weight_and_only_where_usable():
+def test_the_approach_term_shifts_the_log_odds_by_its_weight_and_only_if_usable():
     stream = blank_stream("x", 4).replace(approach=np.array([np.nan, 0.0, 1.5, -9.0]))
     plain, looming = (
         stream_statistic(stream, PRIOR, StatisticSwitches(approach_weight=w)) for w in (0.0, 0.4)

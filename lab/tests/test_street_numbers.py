@@ -23,7 +23,7 @@ SILENT = NotUsable("-")
 
 @given(st.lists(st.floats(3.0, 9.0), min_size=2, max_size=5))
 @settings(max_examples=10)
-def test_vehicles_are_as_near_and_in_view_for_as_long_as_they_were_drawn(gaps_s: list[float]) -> None:
+def test_distances_and_times_in_view_are_those_of_the_drawn_vehicles(gaps_s: list[float]) -> None:
     entries_s = np.round(9.0 + np.cumsum(gaps_s), 1).tolist()
     facts, heard = Facts(list), stream([("left", "left", one) for one in entries_s])
     hidden_rad, lone_rad = vehicle_facts(heard, facts)
@@ -38,7 +38,7 @@ def test_vehicles_are_as_near_and_in_view_for_as_long_as_they_were_drawn(gaps_s:
 
 @given(st.floats(0.3, 0.95), st.floats(0.03, 0.2), st.integers(0, 99))
 @settings(max_examples=10)
-def test_of_peaks_of_which_some_are_anywhere_share_and_spread_are_found(share, std, seed) -> None:
+def test_share_and_spread_of_peaks_are_estimated_with_uniform_outliers(share, std, seed) -> None:
     rng = np.random.default_rng(seed)
     own = rng.random(4000) < share
     errors = np.where(own, std * rng.standard_normal(4000), rng.uniform(-0.5 * math.pi, 0.5 * math.pi, 4000))

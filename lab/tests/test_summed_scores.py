@@ -78,7 +78,7 @@ def trial(columns, unknown=0):
     return Trial(HopTable(hops, "a", "left", 7.0, about))
 
 
-def test_of_68_inputs_35_are_no_evidence_of_the_window() -> None:
+def test_35_of_68_inputs_are_not_window_evidence() -> None:
     columns = np.random.default_rng(0).uniform(0.5, 2.0, size=(40, len(COLUMNS)))
     changed = columns.copy()
     changed[:, :3] += np.random.default_rng(1).normal(size=(40, 3))
@@ -88,7 +88,7 @@ def test_of_68_inputs_35_are_no_evidence_of_the_window() -> None:
     assert not np.allclose(sequence_inputs(columns), sequence_inputs(changed))
 
 
-def test_what_grows_louder_on_a_side_comes_from_there(reading, model) -> None:
+def test_sound_that_grows_louder_on_a_side_comes_from_there(reading, model) -> None:
     other = stream((("right", 15.0),), seed=7, duration_s=20.0)
     said = reading.log_odds(stream_evidence(parts_of(model)[0], other))
     coming = stream_truth(other).coming_s[:, 1] <= 2.0
@@ -107,7 +107,7 @@ def test_a_hop_without_columns_has_the_usual_log_odds(reading, model, streams) -
     assert (reading.log_odds(np.full((3, len(COLUMNS)), np.nan)) == reading.usual).all()
 
 
-def test_sums_are_means_over_three_hops_of_what_they_are_made_of(streams, model) -> None:
+def test_sums_are_means_of_their_terms_over_three_hops(streams, model) -> None:
     columns = stream_evidence(parts_of(model)[0], streams[0])
     # The path of two microphones has one hop more.
     seven, pair = trial(columns[100:150]), trial(columns[160:211], unknown=3)

@@ -45,14 +45,14 @@ def test_every_row_of_the_table_is_there(smoke):
     assert len(report["cautions"]["static"]) == 2
 
 
-def test_line_of_sight_says_nothing_before_sight(smoke):
+def test_line_of_sight_methods_have_no_alarm_before_t0(smoke):
     rows = smoke[1]["protocols"]["static"]
     for name in TABLE_ONE[:3]:
         assert rows[name]["detection"] == 0.0
 
 
 @pytest.mark.slow
-def test_a_second_run_hears_nothing_again_and_says_the_same(smoke, tmp_path, capsys):
+def test_a_second_run_uses_the_cache_and_gives_the_same(smoke, tmp_path, capsys):
     """With two unreadable streams: they are listed and left out, and every table states this."""
     out, report = smoke
     kept = {path: path.stat().st_mtime_ns for path in (out / "cache").rglob("*.npz")}
@@ -95,7 +95,7 @@ def test_a_stream_of_the_same_quiet_recordings_can_be_added(smoke, tmp_path):
     assert found["protocols"]["static"]["published"]["hazard_free_hours"] > 1.9 * before
 
 
-def test_partial_data_are_refused_with_what_is_missing(smoke, tmp_path, capsys):
+def test_partial_data_are_rejected_with_a_list(smoke, tmp_path, capsys):
     out, _ = smoke
     broken = tmp_path / "broken"
     shutil.copytree(out / "smoke", broken, ignore=shutil.ignore_patterns("out_multi.wav"))
@@ -126,7 +126,7 @@ def test_streets_whose_simulation_was_interrupted_are_completed(smoke, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_broken_recording_that_leaves_too_few_is_named(smoke, tmp_path, capsys):
+def test_a_broken_recording_that_leaves_too_few_is_listed(smoke, tmp_path, capsys):
     """Three recordings remain, and no protocol can be run with one approach."""
     out, _ = smoke
     shutil.copytree(out / "smoke", tmp_path / "smoke", copy_function=os.link)
@@ -171,7 +171,7 @@ def test_recordings_of_another_array_two_of_them_broken(tmp_path, capsys):
     assert "not the array of the model" in said and "--uncalibrated" not in said
 
 
-def test_finished_streets_of_another_seed_are_simulated_anew(tmp_path, monkeypatch):
+def test_finished_streets_of_another_seed_are_simulated_again(tmp_path, monkeypatch):
     for name, value in {"SMOKE_STATIC": 1, "SMOKE_S": 0.5, "SMOKE_VIDEO_PX": 64}.items():
         monkeypatch.setattr(table, name, value)
 

@@ -113,13 +113,13 @@ def test_two_tracks_that_swap_once():
     assert (said.identity_switches, said.fragmentations, said.detection) == (2, 0, 1.0)
 
 
-def test_a_gap_interrupts_a_track_and_no_identity():
+def test_a_gap_interrupts_a_track_but_not_its_identity():
     said = track_measures(tracks([*range(5), *range(8, 20)], 3), truth(range(20)), HOP_S)
     assert (said.swap_rate_hz, said.fragmentation_rate_hz) == pytest.approx((0.0, 0.5))
     assert (said.identity_switches, said.fragmentations, said.detection) == (0, 1, 0.85)
 
 
-def test_a_pause_ends_a_period_and_a_new_name_after_it_is_a_swap():
+def test_a_pause_ends_a_period_and_a_new_identity_after_it_is_a_swap():
     said = track_measures(
         tracks([*range(10), *range(25, 30)], [1] * 10 + [2] * 5), truth([*range(10), *range(20, 30)]), HOP_S
     )
@@ -129,7 +129,7 @@ def test_a_pause_ends_a_period_and_a_new_name_after_it_is_a_swap():
     assert (said.identity_switches, said.fragmentations) == (1, 1)
 
 
-def test_silence_is_never_quick():
+def test_a_source_without_a_track_has_no_short_latency():
     said = track_measures(tracks([], 1), truth(range(20)), HOP_S)
     assert (said.latency_s, said.detection) == pytest.approx((2.0, 0.0))
     assert np.isnan(said.azimuth_error_rad)
@@ -138,7 +138,7 @@ def test_silence_is_never_quick():
     assert nothing.active_s == 0.0
 
 
-def test_clear_mot_holds_what_it_matched_where_the_nearest_would_swap():
+def test_clear_mot_keeps_its_matches_if_the_nearest_would_swap():
     """Two adjacent sources, whose tracks cross between them without leaving the gate."""
     both = joined(truth(range(2), 1, 0.05), truth(range(2), 2, -0.05))
     crossing = joined(tracks(range(2), 7, [0.05, -0.05]), tracks(range(2), 8, [-0.05, 0.05]))
@@ -147,7 +147,7 @@ def test_clear_mot_holds_what_it_matched_where_the_nearest_would_swap():
     assert said.swap_rate_hz == pytest.approx(5.0)
 
 
-def test_tracks_to_one_side_of_their_sources_keep_their_order():
+def test_tracks_on_one_side_of_their_sources_keep_their_order():
     """Both assignments cost the same there, except for round-off."""
     hops, rng = range(50), np.random.default_rng(0)
     both = joined(truth(hops, 1, 0.0), truth(hops, 2, 0.1))
@@ -158,7 +158,7 @@ def test_tracks_to_one_side_of_their_sources_keep_their_order():
 
 @given(st.integers(0, 2**32), st.integers(1, 3), st.integers(1, 4))
 @few
-def test_names_and_mirror_change_nothing(seed, sources, names):
+def test_identities_and_mirroring_change_nothing(seed, sources, names):
     rng = np.random.default_rng(seed)
     hop, source = (grid.ravel() for grid in np.indices((12, sources)))
     truths = TruthRows(hop, source, rng.uniform(-2, 2, hop.size), rng.random(hop.size) < 0.8)
@@ -180,7 +180,7 @@ def test_names_and_mirror_change_nothing(seed, sources, names):
     assert 0 <= measures.swap_rate_hz <= measures.fragmentation_rate_hz or np.isnan(measures.swap_rate_hz)
 
 
-def test_rows_that_do_not_fit_are_refused():
+def test_invalid_rows_are_rejected():
     with pytest.raises(InvalidArgumentError, match="azimuth_rad"):
         tracks([0, 1], 1, [0.0, np.nan])
     with pytest.raises(InvalidArgumentError, match="track"):
@@ -191,7 +191,7 @@ def test_rows_that_do_not_fit_are_refused():
 
 @given(st.lists(st.floats(0, 20), min_size=1, max_size=25), st.integers(0, 2**32))
 @few
-def test_no_constant_beats_the_constants_that_stand_beside(true, seed):
+def test_no_constant_beats_the_printed_constants(true, seed):
     true = np.array(true)
     spread = np.random.default_rng(seed).uniform(0, 3, (true.size, 3)) * [-1, 0, 1]
     errors = visible_errors(7.0 + spread, true)

@@ -50,7 +50,7 @@ def write_melaudis(root):
     return root
 
 
-def test_idmt_clips_carry_what_their_names_say(tmp_path):
+def test_idmt_clips_have_the_labels_of_their_names(tmp_path):
     clips = idmt_traffic(write_idmt(tmp_path))
     labels = [clip.labels for clip in clips]
     assert [one.kind for one in labels] == ["car", "car", BACKGROUND, BACKGROUND]
@@ -84,14 +84,14 @@ def test_every_name_of_the_documented_form_is_read(tmp_path):
         (f"audio/{IDMT_NAMES[1]}.wav", IDMT_NAMES[1]),
     ],
 )
-def test_a_partial_idmt_folder_is_refused_with_what_is_missing(tmp_path, lost, named):
+def test_a_partial_idmt_folder_is_rejected_with_the_missing_files(tmp_path, lost, named):
     (write_idmt(tmp_path) / lost).unlink()
     with pytest.raises(InputFileError, match=re.escape(named)):
         idmt_traffic(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["car_01", f"{CAR}_SE_CH34-BG", EMPTY + "_SE_CH34", "../../etc/passwd"])
-def test_a_name_that_is_no_label_is_refused(tmp_path, name):
+def test_a_name_without_a_valid_label_is_rejected(tmp_path, name):
     (write_idmt(tmp_path) / "annotation" / "idmt_traffic_all.txt").write_text(f"{name}.wav\n")
     if "/" not in name:
         write_sound(tmp_path / "audio" / f"{name}.wav")
@@ -109,7 +109,7 @@ def test_melaudis_keeps_one_vehicle_in_free_flow_and_no_vehicle(tmp_path):
     assert {clip.labels.recording for clip in clips} == {"2024-02-09_Fitzroy1", "2023-08-04_Swanston6"}
 
 
-def test_melaudis_background_is_cut_into_clips_that_lie_within_it(tmp_path):
+def test_melaudis_background_is_cut_into_clips_within_the_file(tmp_path):
     clips = [clip for clip in melaudis(write_melaudis(tmp_path)) if "MELAUDIS_BG" in clip.path.parts]
     night = [clip for clip in clips if clip.path.name == "night.wav"]
     assert len(night) == CLIPS_A_FILE
@@ -124,14 +124,14 @@ def test_melaudis_background_is_cut_into_clips_that_lie_within_it(tmp_path):
 
 
 @pytest.mark.parametrize("lost", ["MELAUDIS_Vehicles", "MELAUDIS_BG"])
-def test_a_partial_melaudis_folder_is_refused_with_what_is_missing(tmp_path, lost):
+def test_a_partial_melaudis_folder_is_rejected_with_the_missing_files(tmp_path, lost):
     write_melaudis(tmp_path)
     (tmp_path / lost).rename(tmp_path / "elsewhere")
     with pytest.raises(InputFileError, match=rf"missing: {lost}"):
         melaudis(tmp_path)
 
 
-def test_names_of_another_release_are_refused_and_not_used_in_part(tmp_path):
+def test_names_of_another_release_are_rejected_and_not_partly_used(tmp_path):
     write_melaudis(tmp_path)
     write_sound(tmp_path / "MELAUDIS_Vehicles" / "car_01.wav")
     with pytest.raises(InputFileError, match=r"1 of 7 others, the first 'car_01\.wav'"):

@@ -79,7 +79,7 @@ def approaches(chain, recordings):
     return [tracked(chain, one) for one in recordings if not one.hazard_free]
 
 
-def test_an_empty_street_has_no_vehicle_and_none_is_in_view_before_sight(chain, recordings):
+def test_an_empty_street_has_no_vehicle_and_no_vehicle_is_in_view_before_t0(chain, recordings):
     for one in (recordings[1], recordings[-1], recordings[-2]):
         found = believed_s(chain, one)
         if one.hazard_free:
@@ -88,13 +88,13 @@ def test_an_empty_street_has_no_vehicle_and_none_is_in_view_before_sight(chain, 
             assert found["visible"] and min(found["visible"]) > one.t0_s - 0.05
 
 
-def test_a_vehicle_in_view_is_an_entity_of_its_side_within_a_tenth_of_a_second(approaches):
+def test_a_vehicle_in_view_is_an_entity_on_its_side_within_a_tenth_of_a_second(approaches):
     for one in approaches:
         assert one.delay_s < 0.15
         assert one.side == one.recording.side
 
 
-def test_a_bearing_in_view_is_that_of_the_vehicle_and_no_camera_enters_it(chain, approaches):
+def test_a_bearing_in_view_is_that_of_the_vehicle_and_does_not_use_the_camera(chain, approaches):
     found = figures(approaches)["tracking"]["bearing"]["all"]
     # The vehicle moves by 3 degrees between images.
     assert found["median_deg"] < 3.0
@@ -105,7 +105,7 @@ def test_a_bearing_in_view_is_that_of_the_vehicle_and_no_camera_enters_it(chain,
     assert all(seen.measurement.bearing == alone.measurement.bearing for seen, alone in pairs)
 
 
-def test_tracks_last_through_images_that_are_withheld(approaches):
+def test_tracks_continue_through_withheld_images(approaches):
     found = figures(approaches)["tracking"]["gospa_deg"]["all"]
     assert found[WORLD]["total"] < 0.2 * MISS_DEG
     # It links boxes by their overlap, which is too small after 0.2 s here.
@@ -122,7 +122,7 @@ def test_figures_are_ready_for_json_and_have_a_row_for_each_junction(approaches)
 @pytest.mark.parametrize(
     ("hidden", "expected"), [("same", "kept"), ("other", "another"), (None, "none hidden")]
 )
-def test_identity_is_that_of_the_entity_that_was_hidden(chain, recordings, hidden, expected):
+def test_identity_is_that_of_the_hidden_entity(chain, recordings, hidden, expected):
     scripted = Scripted(chain.path, chain.model, chain.array, hidden=hidden)
     assert tracked(scripted, recordings[0]).identity == expected
 
@@ -168,7 +168,7 @@ def test_the_side_of_a_vehicle_in_view_is_right(real):
 
 
 @pytest.mark.long
-def test_a_time_to_visible_holds_what_it_states(real):
+def test_intervals_of_the_time_to_visible_are_calibrated(real):
     found = real[2]["tracking"]["before_t0"]
     assert found["stated"] > 0.3  # 13 and 10 of 23
     assert found["time_error_s"] < 1.5  # 0.67, 0.91 s
@@ -186,13 +186,13 @@ def test_acoustic_bearings_in_view_are_near_moving_boxes(real):
 
 
 @pytest.mark.long
-def test_tracks_beat_oc_sort_where_every_second_image_is_withheld(real):
+def test_tracks_beat_oc_sort_if_every_second_image_is_withheld(real):
     found = real[2]["tracking"]["gospa_deg"]["all"]
     assert found[WORLD]["total"] < min(found[OC_SORT]["total"], 20.0)  # 13.8 and 14.1; 21.8
 
 
 @pytest.mark.long
-def test_there_are_few_vehicles_where_none_is(real):
+def test_there_are_few_vehicles_in_empty_streets(real):
     path, every, _ = real
     calm = [one for one in every if one.hazard_free][::4]
     found = [believed_s(path, one) for one in calm]
@@ -216,20 +216,20 @@ def heard(takes, tmp_path_factory):
 
 
 @pytest.mark.long
-def test_of_all_microphones_the_entity_in_view_was_there_before(heard):
+def test_with_all_microphones_the_entity_in_view_existed_before(heard):
     warned = [one for one in heard if one.chains["filtered"].alarm[one.hops.before_sight()].any()]
     assert warned
     assert np.mean([_was_there_before(one) for one in warned]) > 0.2
 
 
 @pytest.mark.long
-def test_of_all_microphones_bearings_in_view_are_near_moving_boxes(heard):
+def test_with_all_microphones_bearings_in_view_are_near_moving_boxes(heard):
     errors = np.concatenate([one.hops.srp_rad - one.hops.reference_rad for one in heard])
     assert np.degrees(np.nanmedian(np.abs(errors))) < 7.0  # The paper's is 3.4
 
 
 @pytest.mark.long
-def test_of_all_microphones_the_dynamic_list_is_heard_if_it_is_there(takes, tmp_path_factory):
+def test_with_all_microphones_the_dynamic_list_is_processed_if_available(takes, tmp_path_factory):
     if not takes.dynamic:
         pytest.skip("no dynamic recordings in the data set: not run")
     hearing = Hearer(tmp_path_factory.mktemp("dynamic"))
