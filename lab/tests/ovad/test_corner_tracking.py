@@ -45,7 +45,7 @@ def believed_s(chain, recording):
 
 @dataclass(frozen=True, slots=True)
 class Scripted(Chain):
-    """A chain whose vehicle in view has a name, and that believes in a hidden one before it, or in none."""
+    """A chain with given entities: a named one in view, and before it a hidden one or none."""
 
     hidden: str | None = None
 

@@ -4,9 +4,9 @@ The batch is the minimum work of a tracker: predict and update n Kalman filters 
 measurements, with known association, by einsum.
 
 Stone Soup's GM-PHD and JPDA filters over azimuth use peaks of a microphone array and boxes of a camera. They
-receive the parameters of their theory: detection probability and clutter of each sensor, a nearly constant
-turn rate, and the sector that the camera searches. In Stone Soup the detection probability is a single
-number, so a target outside that sector is excluded from the camera's scan.
+receive the parameters that their theory requires: detection probability and clutter of each sensor, a nearly
+constant turn rate, and the sector that the camera searches. In Stone Soup the detection probability is a
+single number, so a target outside that sector is excluded from the camera's scan.
 """
 
 import time

@@ -166,7 +166,7 @@ def _scored(run: ProtocolRun, track: Progress) -> dict[str, Score]:
 
 @contextmanager
 def _noted(lacking: dict[str, str], name: str) -> Iterator[None]:
-    """Store what a part of the evaluation lacks if it raises an error for missing data."""
+    """Catch an error for missing data in a part of the evaluation, and store its message."""
     try:
         yield
     except InvalidArgumentError as error:

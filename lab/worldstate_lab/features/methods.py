@@ -49,7 +49,7 @@ class LoudestDirection:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of the comparison: a method and a statistic of it."""
+    """One row of the comparison: a method and its statistic."""
 
     method: str  # Name in `methods`
     miss_rate: float  # beta of the statistic

@@ -267,8 +267,8 @@ class TrackMeasures:
     """
 
     latency_s: float  # From the start of a period to its first track; the whole period if there is none
-    swap_rate_hz: float  # Changes of the track that a source has
-    fragmentation_rate_hz: float  # Swaps, and returns of a track that was lost within the period
+    swap_rate_hz: float  # Changes of the track of a source, per second
+    fragmentation_rate_hz: float  # Swaps and returns of a lost track, per second
     azimuth_error_rad: float  # Mean absolute error within the gate
     detection: float  # Share of the hops of a period with a track
     identity_switches: int  # CLEAR-MOT: a match is kept while it is within the gate

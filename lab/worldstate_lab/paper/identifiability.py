@@ -390,7 +390,7 @@ def reach_on_data(
 
 
 def reach_on_table(table: FeatureTable, method: str, rng: np.random.Generator) -> ReachOnData:
-    """Bound the error of any classifier of a table's windows, with the out-of-fold error of a method."""
+    """Bound the error of any classifier on a table's windows, and add a method's out-of-fold error."""
     # With curated references, as prepared.
     chosen = method_of(method)
     posteriors = replace(chosen, reference=None).posteriors(chosen.prepare(table), rng)

@@ -87,7 +87,7 @@ def budget_days(
         return _figures(times_s, per_hour)
 
     def bets(blocks: FloatArray) -> Figures:
-        """Return the figures of days with these outcomes of chances."""
+        """Return the figures of days that consist of these blocks of bets."""
         drawn = (blocks[rng.integers(len(blocks), size=BLOCKS)].reshape(-1, 2).tolist() for _ in range(days))
         return _figures([broken_after_s(one, BET_S) for one in drawn])
 

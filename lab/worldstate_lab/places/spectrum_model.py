@@ -28,9 +28,9 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 
 SPEED_OF_SOUND_MPS = 343.0
-# Sound of far vehicles arrives with the order whose ray still meets the mouth: 2 at 11 m, 3 at 15 m, on
-# alternating sides. With three orders a real vehicle at 9 m was estimated on the wrong side for half a
-# second.
+# The sound of a far vehicle enters the mouth of the street only after several reflections in its side walls:
+# 2 at 11 m, 3 at 15 m, from alternating sides. With at most three, a real vehicle at 9 m was estimated on the
+# wrong side for half a second.
 SIDE_ORDER, FACADE_ORDER = 8, 2
 # A ray this far inside the mouth no longer has the corner's loss of 5 dB.
 LIT_DEPTH_M = 0.5

@@ -58,7 +58,8 @@ def drive_through(
 
     A vehicle at the speed limit is assumed just beyond the visible part of a side as long as the chance that
     a vehicle comes into view from there within `HORIZON_S` is at least the threshold: always at 0, never at
-    infinity. With memory, the vehicle is assumed no nearer than a vehicle can be that was never in sight.
+    infinity. With memory, the
+    assumed vehicle is no nearer than a vehicle that was never in sight can be.
     """
     assumed = encounters.within[..., HORIZONS_S.index(HORIZON_S)] >= threshold
     n = len(encounters)

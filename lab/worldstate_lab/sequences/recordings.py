@@ -26,9 +26,9 @@ _COLUMNS = ("id", "junction", "side", "t0_s", "seconds")
 _AZIMUTHS_RAD = np.radians(np.linspace(-90.0, 90.0, 180))
 _MOST_BYTES = 64 << 20
 # A parked vehicle has a box at its place in images far apart, a passing one only in a few consecutive images.
-# Boxes of a parked car flicker, so an overlap of 0.6 in half of the images would reject too few. With these
-# limits the share of hazard-free images with a moving box is 0.005 (was 0.022); of images after T0 it remains
-# 0.836.
+# Boxes of a parked car flicker, so requiring an overlap of 0.6 in half of the images would miss it. With
+# these limits the share of hazard-free images with a moving box is 0.005 (was 0.022); of images after T0 it
+# remains 0.836.
 _STANDS_IOU, _STANDS_IMAGES, _STANDS_SPAN = 0.5, 3, 0.4
 # Lower than the power of silence.
 LEAST_POWER = 1e-3

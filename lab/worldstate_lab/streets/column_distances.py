@@ -38,7 +38,7 @@ BEFORE_S, CHANGES_S, LAGS_S = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0), (1.0, 2.0, 3.0), (
 T0_S, LENGTH_S, KNOWN_S = 7.0, 10.0, 2.0
 # Interval between rows of a hazard-free excerpt, because adjacent rows are similar
 _HOP_S, _APART_S = 0.1, 0.9
-_ALONE_S = 1.5  # Time after T0 without another vehicle
+_ALONE_S = 1.5  # Minimum time after T0 without another vehicle
 DB = 10.0 / np.log(10.0)
 DRAWS = 200
 _LEAST = 1e-4  # Lower bound of a squared distance in a denominator: a hundredth of the spread is negligible

@@ -1,6 +1,6 @@
 """Input and output of every method: trials and decisions.
 
-A recording of an evaluation is used for test or for training, or is missing.
+`TakeList` has the recordings of an evaluation, for test and for training.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
