@@ -257,12 +257,12 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
     [
         (["--features", "a.csv"], "--lists"),
         (["--model", "a.json"], "--path"),
-        (["--path", "seven", "--streams", "a.npz"], "every path"),
-        (["--windows", "--streams", "a.npz"], "no --windows"),
+        (["--path", "seven", "--streams", "a.npz"], "neither --path"),
+        (["--windows", "--streams", "a.npz"], "nor --windows"),
         (["--start", "9"], "--start"),
     ],
 )
-def test_recordings_that_cannot_be_scored_are_rejected(tmp_path, capsys, words, problem) -> None:
+def test_unsuitable_options_are_rejected(tmp_path, capsys, words, problem) -> None:
     folder = write_corner(tmp_path / "corner", draw())
     assert main(["sequences", str(folder), *words]) == 2
     assert problem in capsys.readouterr().err
