@@ -42,7 +42,7 @@ BACKGROUNDS = 3  # Clips without a vehicle per recording: as many as of cars and
 # Assumed: CNOSSOS gives the mean of a category but not the variation of single vehicles.
 VEHICLE_SPREAD_DB = 3.0
 FAR_LEVEL_DB = (
-    8.0  # of a distant vehicle relative to the ambience: these streets are busier than a blind junction
+    8.0  # level of a distant vehicle relative to the ambience: these streets are busier than a blind junction
 )
 # Assumed, per octave: backgrounds vary from day to day with birds, leaves, building sites and distant roads.
 COLOUR_SPREAD_DB = 3.0
@@ -58,7 +58,7 @@ class MicrophoneGrade:
     # used.
     self_noise_db: float
     low_cut_hz: float
-    gain_db: float = 0.0  # Relative to full scale at `FULL_SCALE_PA`
+    gain_db: float = 0.0  # Gain relative to full scale at `FULL_SCALE_PA`
     gain_spread_db: float = 0.0  # Standard deviation of the gain between recordings
 
 
@@ -75,12 +75,12 @@ class Roadside:
 
     name: str
     microphones: tuple[MicrophoneGrade, ...]
-    ambient_db: float  # Relative to the simulator's street
+    ambient_db: float  # Level relative to the simulator's street
     far_rate: float  # Distant vehicles per ten seconds
     speed_kmh: tuple[float, float]
     distance_m: tuple[float, float]  # Distance of the lanes from the microphone
     kinds: tuple[str, ...]  # Kinds of vehicles that pass in every recording
-    windshield_db: float = 0.0  # Its reduction of the simulator's wind
+    windshield_db: float = 0.0  # Reduction of the simulator's wind by the windshield
     official_split: bool = False  # Every second recording is for training
 
 

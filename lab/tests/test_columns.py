@@ -111,7 +111,8 @@ def test_a_stream_is_cut_at_approaches_of_a_single_vehicle():
     vehicles = (("left", 20.0), ("right", 35.0), ("left", 39.0), ("right", 60.0))
     heard = stream(vehicles, 0)
     found = stream_excerpts(heard, columns(0, len(heard.hops)))
-    assert [one.hazard for one in found] == [True, True, True]  # Not the one that follows after four seconds
+    # The vehicle that follows after four seconds is left out
+    assert [one.hazard for one in found] == [True, True, True]
     assert len(stream_excerpts(heard, columns(0, len(heard.hops)))[0].statistics["5 s before T0"]) == 1
     quiet = stream((), 1)
     assert len(stream_excerpts(quiet, columns(1, len(quiet.hops)))) == int(quiet.hops.time_s[-1] / LENGTH_S)

@@ -405,7 +405,7 @@ def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):
     study = degradation_study(recordings, settings, keep=kept, fingerprint=lambda path: path.name)
     for number, looks in used.items():
         assert not int(looks) & 1 << number
-        assert int(looks).bit_count() == 6  # Four folds of two
+        assert int(looks).bit_count() == 6  # Two recordings in each of four folds
     (sweep,) = study.sweeps
     assert sweep.beta.overall.value[0].tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]
     assert sweep.least_vision.vision.value == 0.0 < sweep.least_awareness.awareness.value

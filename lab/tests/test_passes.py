@@ -181,7 +181,7 @@ def test_an_approaching_vehicle_ranks_above_a_leaving_one_and_certain_chances_ar
     assert (figures["certain_right"], figures["certain_said"]) == (None, 0.0)
     alone = stream([("left", "left", 15.0), ("leaves", "right", 40.0)])
     alone.vehicles.hazard[1], alone.rows.in_view[alone.rows.vehicle == 1] = False, True
-    assert pass_figures([stated(alone, 0.1)])["leaving"] == 0  # in view all the time
+    assert pass_figures([stated(alone, 0.1)])["leaving"] == 0  # It is in view all the time
     told.followed.within[sure, 0] = 0.9
     told.followed.within[np.searchsorted(time_s, 45.0), 1] = 0.9
     figures = pass_figures([told])

@@ -140,7 +140,7 @@ def published_chain_times(sound: Float32Array, array: MicrophoneArray) -> Millis
 
 
 _FOREIGN, _SIGNALS = 9, 4
-_ROWS, _WINDOWS = 150, 40  # Few: the peers' time does not depend on them either
+_ROWS, _WINDOWS = 150, 40  # Few rows are enough: the peers' time does not depend on them either
 
 
 def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:

@@ -51,11 +51,12 @@ except ImportError as error:
 PEAK_DETECTION, PEAK_CLUTTER = 0.25, 1.0 / np.pi
 BOX_DETECTION, BOX_CLUTTER = 0.94, 0.01
 TURN_PSD = 0.014  # 2 m^2/s^3 at 12 m, rad^2/s^3
-START_STD, START_RATE_STD = 0.7, 0.4  # Ahead within 80 degrees; 5 m/s at 12 m
-END_STD = 0.1  # At the ends of the view: half the width of a car at 9 m
-BIRTHS = 0.01  # Per hop: one vehicle in ten seconds
+START_STD, START_RATE_STD = 0.7, 0.4  # Vehicles start ahead within 80 degrees, with 5 m/s at 12 m
+END_STD = 0.1  # Standard deviation at the ends of the view: half the width of a car at 9 m
+BIRTHS = 0.01  # Rate per hop: one vehicle in ten seconds
 HITS = 3  # Boxes that confirm a track, as in OC-SORT
-MISSED_S, UNSEEN_S = 0.35, 3.0  # Without a box while the camera searches there, and in any case
+# Longest times without a box: while the camera searches there, and in any case
+MISSED_S, UNSEEN_S = 0.35, 3.0
 _EPOCH = datetime(2000, 1, 1)
 _TURN = CombinedLinearGaussianTransitionModel([ConstantVelocity(TURN_PSD)])
 _PREDICTOR, _UPDATER = KalmanPredictor(_TURN), KalmanUpdater(None)
@@ -67,8 +68,8 @@ class SensorScan:
 
     detections: tuple[Any, ...]
     detection_probability: float
-    clutter_density: float  # Per radian
-    sector_rad: tuple[float, float]  # From right to left: no target is searched for outside
+    clutter_density: float  # False detections per radian
+    sector_rad: tuple[float, float]  # Searched sector, from right to left
 
     def searches(self, state: Any) -> bool:
         """Return whether the estimated target is in the sector."""
@@ -192,7 +193,7 @@ class Jpda:
 
 ENTITIES = 1, 20
 CROWD = 64, 600  # Boxes per image; the filter accepts 64
-HOPS, WARM_UP = 40, 20  # After tracks are established
+HOPS, WARM_UP = 40, 20  # Timed hops, and hops before them until tracks are established
 _SILENT, _EVEN = NotUsable("not measured"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 
 

@@ -72,11 +72,11 @@ class CommonCause:
     """
 
     level: int
-    noise_db: float  # Relative to the recording's own level
+    noise_db: float  # Noise relative to the recording's own level
     lens: Estimate  # Awareness with rain on the lens only
-    roof: Estimate  # With rain on the roof only
-    rain: Estimate  # With both
-    additive: Estimate  # Clean minus the loss of each effect alone
+    roof: Estimate  # Awareness with rain on the roof only
+    rain: Estimate  # Awareness with both
+    additive: Estimate  # Clean awareness minus the loss of each effect alone
     optimism: Estimate  # `additive` minus `rain`: positive if (A1) is too optimistic
 
 
@@ -86,8 +86,8 @@ class Awareness:
 
     rows: tuple[AwarenessRow, ...]
     common_cause: tuple[CommonCause, ...]
-    hops_in_view: int  # After T0, from which awareness is computed
-    hazard_free_hours: float  # From which false alarms are computed
+    hops_in_view: int  # Hops after T0 from which awareness is computed
+    hazard_free_hours: float  # Hours from which false alarms are computed
 
     def row(self, name: str) -> AwarenessRow:
         """Return the row of a condition."""

@@ -238,7 +238,7 @@ class StagedDetector:
     ['mog2', 'knn']
     """
 
-    name: str  # In tables and files; includes the name of its model
+    name: str  # Name in tables and files; includes the name of its model
     make: Callable[[], Detector]  # Returns a new detector for each video and condition, in any process
     keep: DetectionFilter = field(default_factory=any_motion)  # Filter for its boxes
 
@@ -268,7 +268,7 @@ def look(
     period = max(round(HEALTH_PERIOD_S * rate_hz), 1)
     with one_opencv_thread():
         for number, frame in enumerate(video.frames()):
-            small = reduced_to(frame, width_px)  # Once for all detectors
+            small = reduced_to(frame, width_px)  # Reduced once for all detectors
             for state in conditions:
                 staged = state.stage(small, rng, frame.shape[1] / small.shape[1])
                 for name, rows in boxes.items():

@@ -318,7 +318,8 @@ class SweepItem:
 
     recording: Recording
     tables: Tables = field(default_factory=dict)  # Result of the previous pass
-    rates: Mapping[str, MissRates] = field(default_factory=dict)  # By detector, measured on other recordings
+    # Miss rates by detector, measured on other recordings
+    rates: Mapping[str, MissRates] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return self.recording.recording_id

@@ -65,7 +65,7 @@ class Camera:
     """One detector on the camera of one recording."""
 
     detector: StagedDetector
-    rates: MissRates  # Measured for this detector on other recordings
+    rates: MissRates  # Miss rates of this detector, measured on other recordings
     boxes: HopTable  # Its detections; see `conditions.look`
     readings: HopTable  # Quality of the images
 
@@ -224,9 +224,9 @@ class FalseAdvisories:
 
     name: str
     onsets: int
-    per_hour: Estimate  # With the exact interval
+    per_hour: Estimate  # Onsets per hour with the exact interval
     upper_90: float  # Upper bound of the rate at a confidence of 0.9
-    ratio: Estimate  # Relative to the clean camera, over draws of minutes, the same for both
+    ratio: Estimate  # Ratio to the clean camera, over draws of minutes that are the same for both
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,10 +79,10 @@ class AblationSwitches:
 class AblationRow:
     """One row of the table; a value is None if the streams contain no data for it."""
 
-    auroc: float | None  # Windows before T0 against hazard-free windows
+    auroc: float | None  # AUROC of windows before T0 against hazard-free windows
     detected: float | None  # Share of approaches announced before T0, and their mean lead time
     lead_time_s: float | None
-    false_alarms_per_hour: float | None  # On hazard-free recordings
+    false_alarms_per_hour: float | None  # Rate on hazard-free recordings
     window_rate: float | None
     ece: float | None  # ECE of the risk on the same windows, with its sampling floor
     ece_floor: float | None

@@ -81,11 +81,11 @@ class Evaluation:
     takes: TakeList
     trials: tuple[Trial, ...]
     failed: tuple[Failed, ...]  # Recordings that could not be processed
-    lacking: Mapping[str, str]  # By protocol that was not run: the required data and what was found
+    lacking: Mapping[str, str]  # Required data and what was found, by protocol that was not run
     runs: Mapping[str, ProtocolRun]
-    scores: Mapping[str, Mapping[str, Score]]  # By protocol and method
+    scores: Mapping[str, Mapping[str, Score]]  # Scores by protocol and method
     draws: Mapping[str, IndexArray]  # Resamples of the recordings by protocol, the same for every method
-    front_end: FrontEndStudy | None  # With a standing ego, whose camera is a reference
+    front_end: FrontEndStudy | None  # Study with a standing ego, whose camera is a reference
     degradation: DegradationStudy | None  # Ablation (c), on the recordings with video
     settings: EvaluationSettings
     # By protocol and method that is not scored: why its model does not fit the sound of a recording.

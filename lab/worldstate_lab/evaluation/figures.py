@@ -76,7 +76,7 @@ class PaperValue:
     section: str
     basis: str  # A key of `COMMANDS`
     group: str  # Name of the protocol, or of a part of the paper
-    row: str  # Method, or condition
+    row: str  # Name of a method or condition
     figure: str  # Key in `Score.figures`, if it has one
     value: float
     low: float

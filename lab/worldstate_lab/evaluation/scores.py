@@ -56,7 +56,7 @@ class Scored:
     name: str
     label: str
     site: str
-    fingerprint: str = ""  # Of the recording's content
+    fingerprint: str = ""  # Hash of the recording's content
 
     @classmethod
     def of(cls, trial: Trial) -> "Scored":

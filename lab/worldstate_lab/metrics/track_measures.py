@@ -167,7 +167,7 @@ class Gospa:
 
     total_rad: float
     localisation: float  # Sum of the p-th powers of the errors of the pairs
-    missed: float  # For each truth without an estimate, half of the cut-off to the power p
+    missed: float  # Half of the cut-off to the power p for each truth without an estimate
     false: float  # The same for each estimate without a truth
     pairs: IndexArray  # shape (k, 2): Rows of the matched estimate and truth
 
@@ -266,12 +266,12 @@ class TrackMeasures:
     (0.3, 0.7, 0.0, 0.1)
     """
 
-    latency_s: float  # From the start of a period to its first track; the whole period if there is none
+    latency_s: float  # Time from the start of a period to its first track; the whole period if there is none
     swap_rate_hz: float  # Changes of the track of a source, per second
     fragmentation_rate_hz: float  # Swaps and returns of a lost track, per second
     azimuth_error_rad: float  # Mean absolute error within the gate
     detection: float  # Share of the hops of a period with a track
-    identity_switches: int  # CLEAR-MOT: a match is kept while it is within the gate
+    identity_switches: int  # Identity switches of CLEAR-MOT, which keeps a match while it is within the gate
     fragmentations: int
     active_s: float  # Total length of all periods
 
@@ -319,9 +319,9 @@ class _Matched:
 
     source: IntArray
     period: IndexArray  # Number of the active period
-    place: IndexArray  # Within the period, in hops
+    place: IndexArray  # Position within the period, in hops
     matched: BoolArray
-    track: IntArray  # If matched
+    track: IntArray  # Number of the matched track, if any
     error_rad: FloatArray
 
     def swaps(self) -> IndexArray:

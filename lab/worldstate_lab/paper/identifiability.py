@@ -304,7 +304,7 @@ _BOOTSTRAPS = 200
 class ReachOnData:
     """Bounds on the accuracy with which a data set's features determine its states, for any classifier."""
 
-    states: int  # K, and below n
+    states: int  # Number of states K; the next field is the number of windows n
     windows: int
     entropy_bits: float  # H(z)
     # Estimates of I(z; x), bits: variational lower bound and plug-in from the posteriors, and kNN on the

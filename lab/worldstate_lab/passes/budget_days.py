@@ -20,7 +20,8 @@ from worldstate.operations.recordings.hop_table import HOP_S
 
 from .followed_stream import PassedStream
 
-BLOCK_S, STEP_S, BLOCKS, LATER_BLOCKS = 360.0, 10.0, 240, 60  # A day, and six hours
+# Seconds of a block and of a step; blocks of a day and of six hours
+BLOCK_S, STEP_S, BLOCKS, LATER_BLOCKS = 360.0, 10.0, 240, 60
 
 
 def quiet_blocks(streams: Sequence[PassedStream]) -> FloatArray:

@@ -40,7 +40,7 @@ from worldstate.state.context import Context
 from worldstate.state.cue import Tally
 
 FRAME_S = 0.1
-_STILL_M = 1e-3  # Per 0.1 s: slower vehicles keep their heading
+_STILL_M = 1e-3  # Least motion per 0.1 s: slower vehicles keep their heading
 
 
 def stream_detections(heard: HeardStream, rng: np.random.Generator) -> DetectionLog:
@@ -102,13 +102,13 @@ class FollowedStream:
     time_s: FloatArray  # shape (n,)
     advisory: BoolArray  # shape (n, 2)
     risk: FloatArray  # shape (n, 2)
-    within: FloatArray  # shape (n, 2, horizons); NaN if none is published
+    within: FloatArray  # shape (n, 2, horizons): Chances by horizon; NaN if none is published
     time_to_visible_s: FloatArray  # shape (n, 2, 3): Low, best, high; NaN if none is published
     masked: BoolArray  # shape (n,): Whether the snapshot gives a reason for reduced audibility
     unheard: BoolArray  # shape (n,): Whether the snapshot marks the hop as inaudible
-    entities: tuple[tuple[Entity, ...], ...]  # At every hop
+    entities: tuple[tuple[Entity, ...], ...]  # Entities of every hop
     merged: frozenset[str]  # Identifiers of entities merged into another one
-    tallies: tuple[Tally, ...]  # At every hop: counts of the watch over the alarm's budget
+    tallies: tuple[Tally, ...]  # Counts of the watch over the alarm's budget, at every hop
 
     def hidden(self, hop: int, side: int, least: float = 0.0) -> list[Entity]:
         """Return the entities hidden on a side at a hop with at least this existence probability."""

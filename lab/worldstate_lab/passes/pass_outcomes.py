@@ -58,7 +58,7 @@ from worldstate.state import Entity
 from .followed_stream import PassedStream
 
 QUIET_SHARE, MEAN_HOPS = 0.2, 5
-_PASCAL = FULL_SCALE_PA / 32767.0  # One step of 16 bit
+_PASCAL = FULL_SCALE_PA / 32767.0  # Pressure of one step of 16 bit
 
 
 def level_db(heard: HeardStream) -> FloatArray:

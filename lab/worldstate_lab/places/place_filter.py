@@ -22,7 +22,7 @@ SPEEDS_MPS = np.arange(1.0, 8.1, 0.5)
 VELOCITIES_MPS = np.concatenate([-SPEEDS_MPS[::-1], SPEEDS_MPS])
 # m/s in one second: drivers brake with 0.5 to 1 m/s^2 before a junction.
 SPEED_NOISE = 0.5
-TURNS_HZ = 1e-3  # Few vehicles turn round in a street
+TURNS_HZ = 1e-3  # Turns per second: few vehicles turn round in a street
 # The rates of `state.Rates`, both sides together; departures are vehicles that leave without passing.
 ARRIVALS_HZ, DEPARTURES_HZ = 0.1, 0.01
 # The sound comes from an axle, but the position is that of the vehicle's centre, half a wheelbase (1.35 m)
@@ -186,7 +186,7 @@ def _extent() -> FloatArray:
     return np.asarray(np.exp(-0.5 * (reach / EXTENT_STD_M) ** 2))
 
 
-LANE_STD_M = 1.0  # Either lane of the crossing street
+LANE_STD_M = 1.0  # A vehicle may use either lane of the crossing street
 # Sound from behind walls is never proof of a vehicle.
 LEAST_EXISTENCE, MOST_EXISTENCE = 0.01, 0.99
 

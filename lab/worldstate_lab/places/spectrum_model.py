@@ -206,7 +206,7 @@ class SpectrumModel:
     along_m: FloatArray  # shape (N,): Positions along the crossing street, left positive
     metric: FloatArray  # shape (G, G): Square root of the inverse of C, without the constant component
     templates: FloatArray  # shape (K, N, G): Expected spectra in that metric, normalised to length 1
-    heard_share: FloatArray  # shape (K, N): w
+    heard_share: FloatArray  # shape (K, N): w, the share of the sound that arrives by paths
 
     @classmethod
     def of(

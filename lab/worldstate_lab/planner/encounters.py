@@ -36,7 +36,7 @@ class Crossing:
     width_m: float
     time_s: FloatArray  # shape (r,)
     to_come_m: FloatArray  # shape (r,): Distance of its front to the axis, negative after crossing
-    in_view: BoolArray  # shape (r,): From the position at which the state was recorded
+    in_view: BoolArray  # shape (r,): Whether it is in view from the position at which the state was recorded
 
     def at(self, clock_s: FloatArray) -> FloatArray:
         """Return the distance to the axis at given times; before the first row its first speed is assumed."""
@@ -114,16 +114,17 @@ class EgoVehicle:
     width_m: float = 1.8
     # Cameras in the corners of the bumper, as for parking aids: from behind a windscreen, two metres back, no
     # camera sees into these streets before the bumper has entered them.
-    eye_m: float = 0.5  # Behind the bumper
-    limit_mps: float = 25.0 / 3.6  # On both streets; the fastest vehicle of the streams drives at 22 km/h
+    eye_m: float = 0.5  # Distance of the camera behind the bumper
+    # Speed limit of both streets; the fastest vehicle of the streams drives at 22 km/h
+    limit_mps: float = 25.0 / 3.6
     acceleration_mps2: float = 2.0
-    comfortable_mps2: float = 2.0  # Braking for a possible vehicle
-    full_mps2: float = 6.0  # Braking for a vehicle in view
+    comfortable_mps2: float = 2.0  # Deceleration for a possible vehicle
+    full_mps2: float = 6.0  # Deceleration for a vehicle in view
     reaction_s: float = 0.3
-    begins_m: float = 30.0  # Start before the line at which it would stop
+    begins_m: float = 30.0  # Start of the drive before the line at which it would stop
     begins_mps: float = 25.0 / 3.6
-    gap_m: float = 0.25  # Between the stopped bumper and a passing vehicle
-    gap_s: float = 0.3  # Between one vehicle leaving and another entering the conflict zone
+    gap_m: float = 0.25  # Distance between the stopped bumper and a passing vehicle
+    gap_s: float = 0.3  # Time between one vehicle leaving and another entering the conflict zone
 
     def stopping_speed_mps(self, room_m: FloatArray, reaction_s: float) -> FloatArray:
         r"""Return the highest speed from which it stops within d metres after the reaction time tau.
@@ -160,7 +161,8 @@ FROM_STANDING = EgoVehicle(begins_m=3.5, begins_mps=0.0)
 STEP_S, HOP_STEPS = 0.05, 2
 LASTS_S = 25.0
 STEPS = round(LASTS_S / STEP_S)
-MEETS_WITHIN_S = 3.0  # Between a vehicle and an ego that never brakes, in the middle of the conflict zone
+# Largest time difference in the conflict zone between a vehicle and an ego that never brakes
+MEETS_WITHIN_S = 3.0
 MOST_VEHICLES = 6
 _NEAR_M, _BEFORE_S, _AFTER_S, _PASSED_S = 12.0, 1.0, 15.0, 8.0
 # Half the width of the widest lorry: the margin of a planner if it sees no vehicle.
@@ -180,7 +182,8 @@ class Encounters:
     within: FloatArray  # shape (n, STEPS / HOP_STEPS, 2, horizons)
     # shape (n, STEPS, K): Distance of the front to the ego's axis, negative after crossing
     to_come_m: FloatArray
-    in_view: BoolArray  # shape (n, STEPS, K): From the position at which the state was recorded
+    # shape (n, STEPS, K): Whether it is in view from the position at which the state was recorded
+    in_view: BoolArray
     side: IndexArray  # shape (n, K)
     length_m: FloatArray  # shape (n, K)
     width_m: FloatArray  # shape (n, K)

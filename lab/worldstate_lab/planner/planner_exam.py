@@ -222,7 +222,7 @@ class ByKind(NamedTuple, Generic[Of]):
 
 
 Corners = ByKind[Encounters]
-CornerDrives = ByKind[Drives]  # Of one planner
+CornerDrives = ByKind[Drives]  # Drives of one planner
 
 
 def draw_corners(

@@ -27,7 +27,7 @@ PAPER: Mapping[str, float] = {
     "prominence_in_silence": 1.18,
     "looming_auroc": 0.735,
     "looming_correlation": 0.07,
-    "doppler_usable": 1.0,  # Of 41 approaches
+    "doppler_usable": 1.0,  # One of 41 approaches
 }
 DRAWS, DELAY_DRAWS = 500, 200
 # In these recordings a spectrum shows the azimuth at which the camera detects a vehicle 0.4 to 0.5 s later.

@@ -38,8 +38,8 @@ class Heard:
     """Recordings processed on one path; all sequences have the same order."""
 
     recordings: Sequence[CornerRecording]
-    seen: Sequence[Trial]  # With the camera, if there is one
-    alone: Sequence[Trial]  # With sound alone
+    seen: Sequence[Trial]  # Trials with the camera, if there is one
+    alone: Sequence[Trial]  # Trials with sound alone
     followed: Sequence[Tracked | None]  # None without a camera, since no vehicle in view is known then
 
 
@@ -166,7 +166,7 @@ def score_figures(
 
 
 _MEAN_HOPS = 20  # Two seconds
-_LEAST_NATS = -20.0  # If the window gives no sides
+_LEAST_NATS = -20.0  # Value if the window gives no sides
 _SMALLEST = 1e-9  # Lower bound of a probability before its log-odds are computed
 
 

@@ -36,12 +36,12 @@ LEADS_S = (0.5, 1.0, 1.5, 2.0, 3.0)
 # This long before T0 the vehicle is inaudible: a score above chance comes from the ambience of its recording.
 CONTROLS_S = (5.0, 6.0)
 ONSETS, FALSE_RECORDINGS = (0, 1, 3, 6), (0, 1, 2, 3)
-LASTS_S = 0.5  # Before T0
-PASSED_S = 2.0  # After T0; later advisories concern a vehicle that has passed
+LASTS_S = 0.5  # Time before T0 at which a lasting alarm is on
+PASSED_S = 2.0  # Time after T0; later advisories concern a vehicle that has passed
 WITHIN_S = 2.0  # Horizon of the calibrated chance
 
 Row = dict[str, Any]
-Alarms = Sequence[BoolArray]  # One per trial, shape (n,)
+Alarms = Sequence[BoolArray]  # One mask per trial, shape (n,)
 
 
 def hop_before(trial: Trial, lead_s: float) -> IndexArray:

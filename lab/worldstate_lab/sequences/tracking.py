@@ -37,7 +37,7 @@ from .recordings import CornerRecording
 # degrees of pass labels, half of the vehicles have 11 boxes or fewer, with 15 they have 17.
 NEAR_RAD = math.radians(15.0)
 EARLY_S = 0.3  # T0 agrees with the images to within this time
-HIDDEN_S, STATED_S = 1.0, 3.0  # Before T0, for hidden entities and for times to visible
+HIDDEN_S, STATED_S = 1.0, 3.0  # Times before T0, for hidden entities and for times to visible
 LATE = 0.9  # Quantile of the delays of a hand-over
 # Delays of the images after a bearing. If the error is smallest at a delay other than 0, the sound and the
 # images are not synchronous.
@@ -54,10 +54,10 @@ class Tracked:
     """Result of tracking the vehicle of one approach."""
 
     recording: CornerRecording
-    identity: str  # Of the entity in view: kept, another, none hidden; no box
-    delay_s: float  # From the first box to a visible entity, infinite if there is none; NaN: no box
-    side: str | None  # Of the first entity matched to the vehicle
-    cues: HopTable  # In the last seconds before T0
+    identity: str  # Identity of the entity in view: kept, another, none hidden; no box
+    delay_s: float  # Time from the first box to a visible entity, infinite if there is none; NaN: no box
+    side: str | None  # Side of the first entity matched to the vehicle
+    cues: HopTable  # Cues in the last seconds before T0
     bearings: HopTable  # Acoustic bearings of hops with a moving box, computed without the camera
     # By method; shape (images, 4): number of boxes, then the parts of GOSPA in degrees
     costs: Mapping[str, FloatArray]

@@ -176,7 +176,7 @@ class SignatureRow:
     figure: str  # AUROC, balanced accuracy or Hz
     # None if a corpus is missing or too small: the note contains the command that computes it
     value: float | None
-    low: float | None = None  # Interval of 95 % over recordings
+    low: float | None = None  # Ends of the 95 % interval over recordings
     high: float | None = None
     paper: tuple[float, float] | None = None  # Ends of its range, equal if the paper gives one number
     n_clips: int = 0

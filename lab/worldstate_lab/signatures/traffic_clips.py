@@ -26,7 +26,7 @@ class ClipLabels:
 
     kind: str  # `BACKGROUND` or the kind of the single passing vehicle
     microphone: str  # "studio", "mems" or "phone"
-    recording: str  # The same for clips with the same day, place and background
+    recording: str  # Recording, the same for clips with the same day, place and background
     site: str
     split: str = ""  # "train" or "test" of an official split
 

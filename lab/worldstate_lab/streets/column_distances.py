@@ -130,11 +130,11 @@ def stream_excerpts(heard: HeardStream, columns: FloatArray) -> list[Excerpt]:
 class Distances:
     """Squared distances of every column, shape (11,) each, and ratios of simulated to real distances."""
 
-    real: FloatArray  # Between real junctions
-    halves: FloatArray  # Between halves of one real junction, zero except for chance
-    simulated: FloatArray  # Between simulated and real junctions
+    real: FloatArray  # Distances between real junctions
+    halves: FloatArray  # Distances between halves of one real junction, zero except for chance
+    simulated: FloatArray  # Distances between simulated and real junctions
     ratios: tuple[Value, ...]  # sqrt(simulated / real) with its interval over recordings
-    median: Value  # Of these ratios
+    median: Value  # Median of these ratios
     # The same ratio for the means of the squared distances over columns, which is less affected by chance
     mean: Value
 

@@ -150,7 +150,7 @@ class RealismRow:
 
     figure: str
     windows: str
-    real: float | None  # Of all real windows
+    real: float | None  # Figure of all real windows
     halves: Span | None  # Smallest and largest value of real against real: groupings, junctions of a type
     junctions: Span | None
     allowed: Span | None  # Range of a simulated figure that counts as inside
@@ -311,7 +311,7 @@ class Realism:
     groupings: tuple[str, ...]
     rows: tuple[RealismRow, ...]
     transfers: Mapping[str, Transfer]
-    profiles: Mapping[str, Mapping[str, Profile]]  # By set and junction
+    profiles: Mapping[str, Mapping[str, Profile]]  # Profiles by set and junction
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; every row includes `inside` and `met`."""
