@@ -409,7 +409,7 @@ def realism_lines(found: Realism) -> list[str]:
         met = [row.met.get(name) for row in found.rows]
         lines.append(
             f"{name}: inside {inside.count(True)}, outside {inside.count(False)}; "
-            f"as asked {met.count(True)}, not {met.count(False)}"
+            f"requirements met {met.count(True)}, missed {met.count(False)}"
         )
     gains = [
         (name, one.auroc, one.scalar, _span(one.gain), float(one.windows))

@@ -193,7 +193,7 @@ def windows_from_recordings(takes: TakeList, folder: Path) -> tuple[FeatureTable
     if not path.is_file():
         write_features(path, feature_table(found, list(extract_features(found, array)), array))
     table = read_features(path)
-    return table, f"{len(table)} windows of {len(names)} recordings that are not tested"
+    return table, f"{len(table)} windows of {len(names)} recordings outside the test set"
 
 
 def windows_origin(windows: Sequence[LabelledWindow], array: MicrophoneArray, memo: Path) -> str:

@@ -325,6 +325,6 @@ def _facts(found: Evaluation) -> tuple[tuple[str, str], ...]:
         ("data", found.takes.origin),
         ("fingerprint of the data", data_fingerprint(found.trials) if found.trials else "none"),
         ("seeds of the folds", ", ".join(map(str, settings.seeds))),
-        ("hazard-free hours asked for", str(settings.hazard_free_hours or "all")),
+        ("requested hazard-free hours", str(settings.hazard_free_hours or "all")),
         ("draws of recordings for intervals", str(settings.draws)),
     )
