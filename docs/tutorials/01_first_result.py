@@ -1,4 +1,4 @@
-"""A first result: push sound into a listener, and print when an advisory begins."""
+"""A first result: push sound into a listener and print when an advisory begins."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ for state in states:
         if cue.advisory and cue.advisory.since_ns == state.stamp_ns:
             print(f"{state.stamp_ns / 1e9:.1f} s: advisory {cue.direction}, risk {cue.risk:.2f}")
 
-# The figure: the same street, and without a vehicle.
+# The figure: the same street with and without a vehicle.
 from dataclasses import replace
 
 from tutorial_figures import draw_sides, tutorial_figure

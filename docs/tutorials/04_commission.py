@@ -1,4 +1,4 @@
-"""A model for your array and your alarms, learned from streets that are simulated for it."""
+"""A model for your array and your budget, trained with streets that are simulated for it."""
 
 from pathlib import Path
 
@@ -9,11 +9,11 @@ from worldstate.commissioning.stream_exam import exam_figures, write_exam_figure
 
 array = MicrophoneArray([(x, y, 0.0) for x in (0.1, -0.1) for y in (0.1, -0.1)])
 settings = quick_settings(CommissionSettings(onsets_per_hour=20.0))
-model = commission(array, settings, Path("out/tutorials/streams"))  # what was heard once is kept there
+model = commission(array, settings, Path("out/tutorials/streams"))  # finished parts are kept there
 examined = exam_of(array, model, settings, Path("out/tutorials/streams"))
 print(f"fit for use: {model.provenance.fit_for_use}")
-for name in ("approaches", "detected", "hazard_free_hours", "onsets_high"):
+for name in ("auroc_last_second", "approaches", "detected", "onsets_high"):
     print(f"{name}: {exam_figures(examined)[name]:.2f}")
 
-# The figure: what the exam found, at a junction that was not learned.
+# The figure: the exam at a junction that the model did not learn.
 write_exam_figure(examined, Path("out/tutorials/04_commission.png"))

@@ -1,11 +1,11 @@
-"""Another modality: headlights on a wall as evidence for a hidden vehicle."""
+"""Another modality: the light of headlights on a wall as evidence for a hidden vehicle."""
 
 import numpy as np
 
 from worldstate import Measurement, NotUsable, SignatureEvidence, Unqueried, WorldFilter
 
-# Nats: the wall is brighter by 4 +- 1 with a hidden vehicle on the left, else by 0 +- 1.
-world, states, no_sound = WorldFilter(), [], NotUsable("not measured by light")
+# The wall is brighter by 4 +- 1 units if a vehicle is hidden on the left, and by 0 +- 1 otherwise.
+world, states, no_sound = WorldFilter(), [], NotUsable("a camera for light measures no sound")
 for hop, noise in enumerate(np.random.default_rng(5).normal(size=40).tolist()):
     brighter = noise + (4.0 if 10 <= hop < 25 else 0.0)
     hidden, other = -0.5 * (brighter - 4.0) ** 2, -0.5 * brighter**2

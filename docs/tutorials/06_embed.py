@@ -1,4 +1,4 @@
-"""Embed it in a stack: a process ends, and another one goes on from its checkpoint at the next sample."""
+"""Embed it in a stack: a process ends, and another one continues from its checkpoint at the next sample."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ first, last = np.split(sound, [27_000])  # the process ends at 4.5 s
 listener = Listener(ovad_array(), 6000.0)
 before = [state for block in np.array_split(first, 450) for state in listener.push(block)]
 resumed = before + Listener(ovad_array(), 6000.0, resume=listener.checkpoint()).push(last)
-print(f"{len(resumed)} states, as without the break: {resumed == Listener(ovad_array(), 6000.0).push(sound)}")
+print(f"{len(resumed)} states, equal to one process: {resumed == Listener(ovad_array(), 6000.0).push(sound)}")
 
-# The figure: the other process with the checkpoint and without it.
+# The figure: the second process with and without the checkpoint.
 from tutorial_figures import draw_sides, tutorial_figure
 
 with tutorial_figure(__file__, 8.0, 3.2) as figure:
@@ -22,7 +22,7 @@ with tutorial_figure(__file__, 8.0, 3.2) as figure:
     draw_sides(axes[0], resumed, street.entry_s)
     draw_sides(axes[1], before, street.entry_s)
     draw_sides(axes[1], Listener(ovad_array(), 6000.0, start_s=4.5).push(last))
-    for one, title in zip(axes, ("resumed from the checkpoint", "begun anew"), strict=True):
+    for one, title in zip(axes, ("continued from the checkpoint", "started without it"), strict=True):
         one.axvspan(4.45, 4.55, color="lightgrey", label="the process ends")
         one.set(title=title)
     axes[0].set(ylabel="chance to come into view within 3 s")

@@ -1,17 +1,17 @@
-"""A planner: be ready to stop at a blind corner only while the state gives a vehicle a chance to come."""
+"""A planner: be ready to stop at a blind corner only while a vehicle may come into view."""
 
 from worldstate import WorldState, listen
 from worldstate.simulation import DatasetSettings, write_dataset
 
 
 def chance(state: WorldState) -> float:
-    """Return the larger chance of both sides within 3 s; one where none is stated."""
+    """Return the larger chance of the two sides within 3 s; 1 if the state has none."""
     return max(1.0 if cue.within is None else cue.within["3"] for cue in state.cues)
 
 
 rows = write_dataset("out/tutorials/streets", DatasetSettings(n_static=2, seed=1, bandwidth_hz=2000.0))
-heard = [[*listen(f"out/tutorials/streets/{row.folder}")] for row in rows]
-for row, states in zip(rows, heard, strict=True):
+runs = [[*listen(f"out/tutorials/streets/{row.folder}")] for row in rows]
+for row, states in zip(rows, runs, strict=True):
     ready = sum(chance(state) >= 0.01 for state in states)
     print(f"vehicle: {row.approach}; ready to stop in {ready} of {len(states)} states")
 
@@ -24,7 +24,7 @@ THRESHOLDS = {"no knowledge": np.inf, "phantom": 0.0, "chance": 0.01}
 
 
 def drive(states: list[WorldState], threshold: float) -> np.ndarray:
-    """Return metres beyond the line and km/h, state by state, of a car that starts 20 m before it."""
+    """Return the position beyond the line in metres and the speed in km/h of a car, for each state."""
     beyond_m, speed, way = -BEGINS_M, LIMIT_MPS, []
     for state in states:
         way.append((beyond_m, 3.6 * speed))
@@ -36,8 +36,8 @@ def drive(states: list[WorldState], threshold: float) -> np.ndarray:
 
 
 with tutorial_figure(__file__, 8.0, 3.2) as figure:
-    for axes, row, states in zip(figure.subplots(1, 2, sharey=True), rows, heard, strict=True):
-        begins_s = 0.1 * row.t0_frame - BEGINS_M / LIMIT_MPS  # without braking at the line at line of sight
+    for axes, row, states in zip(figure.subplots(1, 2, sharey=True), rows, runs, strict=True):
+        begins_s = 0.1 * row.t0_frame - BEGINS_M / LIMIT_MPS  # reaches the line at T0 if it does not brake
         driven = [state for state in states if state.stamp_ns >= 1e9 * begins_s]
         for (name, threshold), dashes in zip(THRESHOLDS.items(), ("-", "-", "--"), strict=True):
             axes.plot(*drive(driven, threshold).T, dashes, label=name)

@@ -1,6 +1,7 @@
 """The tutorials run, and their pages show what they print and draw."""
 
 import ast
+import json
 import re
 import runpy
 from pathlib import Path
@@ -57,3 +58,26 @@ def test_a_page_begins_with_few_lines_and_ends_in_its_figure(script):
     begin, rest = shown % "end-before", shown % "start-at"
     assert page.index(begin) < page.index(f"(figures/{script.stem}.png)") < page.index(rest)
     assert 10_000 <= (FOLDER / "figures" / f"{script.stem}.png").stat().st_size <= 80_000
+
+
+def printed_by(notebook) -> list[str]:
+    """Return the printed text of each cell."""
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    return ["".join("".join(part.get("text", "")) for part in cell["outputs"]) for cell in cells]
+
+
+@pytest.mark.long
+def test_the_notebook_prints_what_it_shows():
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    path = FOLDER / "first_sound.ipynb"
+    shown = printed_by(json.loads(path.read_text(encoding="utf-8")))
+    notebook = nbformat.read(path, as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    assert printed_by(notebook) == shown != [""] * len(shown)
+
+
+def test_the_gallery_has_every_figure_with_a_caption():
+    page = (FOLDER / "gallery.md").read_text(encoding="utf-8")
+    captions = re.findall(r"\(figures/(\w+)\.png\)\n\n\*Look at ", page)
+    assert captions == [script.stem for script in SCRIPTS]
