@@ -1,12 +1,13 @@
-"""A detector of one's own: NanoDet-m on crops of an image, with OpenCV and onnxruntime.
+"""Your own detector: NanoDet-m on crops of an image, with OpenCV and ONNX Runtime.
 
-The network takes 416 pixels a side. On a whole image of 1936 pixels a car that is 60 pixels high would be 13,
-so it looks at three crops of 832 pixels, which overlap by a third. In a program the detector is handed over:
+The input of the network has 416 pixels per side. Scaled down from a whole image of 1936 pixels, a car of 60
+pixels would be 13 pixels high. The detector therefore uses three crops of 832 pixels that overlap by a third.
+In Python:
 
     open_source("recording", detector=open_nanodet("nanodet_m.onnx"))
 
-For `worldstate run --detector nanodet` a package names it, as own_parts does; the model is then the file that
-the environment variable NANODET_ONNX names:
+For `worldstate run --detector nanodet`, a package registers it as `own_parts` does. The environment variable
+NANODET_ONNX is then the path of the model:
 
     [project.entry-points."worldstate.detectors"]
     nanodet = "nanodet:open_nanodet"
@@ -27,7 +28,7 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageArray
 
-# Pixels a side of the network's input, and its normalisation: blue, green, red.
+# Pixels per side of the input of the network, and its normalisation: blue, green, red.
 SIDE_PX = 416
 MEAN = np.array([103.53, 116.28, 123.675], np.float32)
 DEVIATION = np.array([57.375, 57.12, 58.395], np.float32)
@@ -35,21 +36,21 @@ STRIDES_PX = (8, 16, 32)
 # The distance to each side of a box is the expected value over so many bins, in strides.
 BINS = 8
 MIN_SCORE = 0.3
-# Of two boxes that overlap by more the better one is kept, of any class: one vehicle is a car and a truck.
+# If two boxes overlap by more, the better one is kept, whatever its class: one vehicle may look like two.
 MOST_OVERLAP = 0.5
-# An inner edge of a crop cuts vehicles in two. Such a part counts for less than the whole, which another crop
-# shows, and is dropped if so much of it lies in a better box.
+# An inner edge of a crop cuts vehicles in two. The score of such a part is reduced, because another crop
+# contains the whole vehicle, and the part is dropped if this share of it is inside a better box.
 CUT_PX, CUT_SCORE, MOST_WITHIN = 6.0, 0.8, 0.7
-# The network's classes are COCO's eighty; those of the road stand at these places.
+# Indices of road users among the eighty classes of COCO, which the network uses.
 CLASSES = tuple(YOLO_CLASSES)
 
 Crop = tuple[float, float, float]  # Left, top, side; pixels of the image
-# Three across an image of 1936 x 1216 pixels: in the middle they hold the street, above them is sky.
+# Three crops across an image of 1936 x 1216 pixels that contain the street and not the sky.
 OVAD_CROPS: tuple[Crop, ...] = ((0.0, 337.0, 832.0), (552.0, 337.0, 832.0), (1104.0, 337.0, 832.0))
 
 
 class NanoDet:
-    """NanoDet-m on crops of an image; non-maximum suppression joins what they find.
+    """NanoDet-m on crops of an image; non-maximum suppression joins their boxes.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ class NanoDet:
 
 
 def _within_better(boxes: FloatArray) -> BoolArray:
-    """Return which boxes, the best first, lie for the most part in a better one, or such a one in them."""
+    """Return which boxes, the best first, are mostly inside a better box or contain most of one."""
     low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
     common = np.clip(high - low, 0.0, None).prod(axis=2)
@@ -99,7 +100,7 @@ def _within_better(boxes: FloatArray) -> BoolArray:
 
 
 def cut(frame: ImageArray, crop: Crop) -> ImageArray:
-    """Return a crop of an image in the network's size."""
+    """Return a crop of an image, scaled to the input size of the network."""
     left, top, side = map(round, crop)
     part = frame[top : top + side, left : left + side]
     if part.shape[:2] == (SIDE_PX, SIDE_PX):
@@ -109,13 +110,13 @@ def cut(frame: ImageArray, crop: Crop) -> ImageArray:
 
 
 def as_input(image: ImageArray) -> Float32Array:
-    """Return an image as the network takes it, shape (1, 3, 416, 416)."""
+    """Return an image as input of the network, shape (1, 3, 416, 416)."""
     planes = ((image - MEAN) / DEVIATION).astype(np.float32).transpose(2, 0, 1)
     return np.ascontiguousarray(planes[None])
 
 
 def decoded(outputs: Sequence[NDArray[np.generic]]) -> tuple[FloatArray, FloatArray]:
-    r"""Return boxes (n, 4) in pixels of the input, and their scores by class (n, classes).
+    r"""Return boxes (n, 4) in pixels of the input, and their scores per class (n, classes).
 
     .. math:: d = s \sum_b b\, e^{z_b} / \sum_b e^{z_b}
 
@@ -134,19 +135,19 @@ def _by_stride(outputs: Sequence[NDArray[np.generic]]) -> Iterator[tuple[FloatAr
         weights = np.exp(np.asarray(logits, np.float64)[0, kept].reshape(-1, 4, BINS))
         sides = stride_px * (weights @ np.arange(BINS)) / weights.sum(axis=2)
         rows, columns = np.divmod(kept, SIDE_PX // stride_px)
-        # The middle of a cell of so many pixels, counted from the middle of its first one.
+        # Centre of a cell of `stride_px` pixels, measured from the centre of its first pixel.
         centres = stride_px * np.column_stack([columns, rows]) + 0.5 * (stride_px - 1)
         yield np.hstack([centres - sides[:, :2], centres + sides[:, 2:]]), np.clip(scores[kept], 0.0, 1.0)
 
 
 def open_nanodet(path: str | Path | None = None, crops: Sequence[Crop] = OVAD_CROPS) -> NanoDet:
-    """Open the model, on one thread: recordings are what is worked on side by side."""
+    """Open the model on one thread, because recordings are processed in parallel."""
     name = Path(path or os.environ.get("NANODET_ONNX", "nanodet_m.onnx"))
     if not name.is_file():
-        raise InputFileError(name, "expected an ONNX model, nothing is there")
+        raise InputFileError(name, "expected an ONNX model, found no file")
     onnxruntime = optional("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # Exporters list every weight as an input, which is warned of
+    options.log_severity_level = 3  # Exporters list every weight as an input, and the runtime warns of each
     session = onnxruntime.InferenceSession(str(name), options, providers=["CPUExecutionProvider"])
     return NanoDet(session, crops)

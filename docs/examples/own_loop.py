@@ -1,21 +1,18 @@
-"""A loop of one's own: own array, own detector, own signature model, around the filter.
+"""A loop with your own array, detector and signature model around the filter.
 
-Eight microphones on a car's roof hear a vehicle that comes out of a side street on the left. A camera of 70
-degrees sees it only once it has passed the corner. Everything that a user would bring stands here as a plain
-class, and everything of the library is imported from `worldstate` itself:
+Eight microphones on the roof of a car record a vehicle that comes out of a side street on the left. A camera
+of 70 degrees sees it only after it has passed the corner. Each part that you would replace is a plain class:
 
 - the array is a table of positions;
 - the detector is any object with ``detect(image)``;
 - the signature model is any object with ``evidence(feature)``;
 - the camera is any object with ``ask`` and ``sightings``, here the detector behind a pinhole camera.
 
-Windows of a second, one every 0.1 s, repeat most of their sound. Of each the filter takes what is new in its
-posterior: a steady sound is believed as much as one window of it, however long it lasts. An image is a look,
-and empty looks accumulate until a broken camera is the likelier reason. The alarm is one threshold on the
-log-odds of a hidden vehicle, and names the likelier side.
+Windows of one second, one per 0.1 s, share most of their sound. The filter uses only what is new in each
+window, so that a steady sound counts once. Empty images accumulate as evidence until a broken camera is the
+more likely reason. The alarm is one threshold on the log-odds of a hidden vehicle.
 
-Sound and images are simulated: a plane wave of noise and a bright block, nothing that a model should be
-trained on.
+Sound and images are simulated: a plane wave of noise and a bright block. Do not train a model with them.
 
 Run it:
 
@@ -48,7 +45,7 @@ from worldstate.measurement import Bearing
 
 RATE_HZ = 16_000
 IMAGE_PX = (700, 300)
-# When the vehicle passes the corner, which stands 32 degrees to the left, and how fast it turns from there.
+# Time at which the vehicle passes the corner, azimuth of the corner, and rate of its azimuth after that.
 IN_VIEW_S, CORNER_RAD, TURNING_RAD_S = 4.0, math.radians(32.0), -0.3
 
 
@@ -60,7 +57,7 @@ def my_array() -> MicrophoneArray:
 
 
 class BrightBlocks:
-    """A detector: every column of an image that is brighter than half belongs to one vehicle."""
+    """A detector: all columns above a brightness of 64 belong to one vehicle."""
 
     def detect(self, image: np.ndarray) -> DetectionFrame:
         """Return boxes in pixels, scores and labels of one image (height, width, 3)."""
@@ -72,7 +69,7 @@ class BrightBlocks:
 
 
 class LiveCamera:
-    """A camera with a detector, asked what it sees: a `CoEvidenceChannel`."""
+    """A camera with a detector: a `CoEvidenceChannel`."""
 
     def __init__(self, detector: BrightBlocks, miss_rate: float = 0.05) -> None:
         width_px, height_px = IMAGE_PX
@@ -81,7 +78,7 @@ class LiveCamera:
         self._seen: tuple[Sighting, ...] | None = None
 
     def look(self, image: np.ndarray) -> None:
-        """Take the next image."""
+        """Detect vehicles in the next image."""
         found = self._detector.detect(image)
         boxes = zip(found.boxes_px, found.labels, found.scores.tolist(), strict=True)
         self._seen = tuple(self._camera.sighting(box, label, score) for box, label, score in boxes)
@@ -93,30 +90,30 @@ class LiveCamera:
         expected_labels: Collection[str] | None = None,
         side: str | None = None,
     ) -> Present | Absent | Unqueried:
-        """Say whether a vehicle is in view at all: a source behind the corner is heard beside it."""
+        """Return whether any vehicle is in view: the bearing of a hidden source is not its direction."""
         if self._seen is None:
             return Unqueried("no image yet")
         return Present(self._miss_rate) if self._seen else Absent(self._miss_rate)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
-        """Return all that is in view."""
+        """Return the vehicles in view."""
         return self._seen or ()
 
     def last_look(self, stamp_ns: int) -> None:
-        """Every answer is a look of its own: no camera here is asked by two sources."""
+        """Return None: every answer is a new image, because only one source queries this camera."""
 
 
 class PatternSignature:
-    """A signature model without training: where the spatial pattern peaks, and by how much.
+    """A signature model without training: it uses the position and the height of the peak of the power.
 
-    The feature holds the steered power at thirty azimuths from left to right, of the first and of the second
+    The feature contains the steered power at thirty azimuths from left to right, for the first and the second
     half of the last second.
     """
 
     def evidence(self, feature: np.ndarray) -> SignatureEvidence:
         """Return log-likelihoods of one window, nats."""
         pattern = feature.reshape(2, 30)[1]
-        # In noise alone these microphones have peaks of up to three times the median, with this vehicle six.
+        # Noise alone has peaks of up to three times the median, this vehicle of six times.
         sounding = float(pattern.max() / np.median(pattern)) - 4.0
         share = float(pattern.argmax()) / 29.0
         left, right = 3.0 * (0.35 - share), 3.0 * (share - 0.65)
@@ -127,14 +124,14 @@ class PatternSignature:
 
 
 def azimuth_at(time_s: float) -> float:
-    """Return where the sound comes from: round the corner as long as it hides the vehicle."""
+    """Return the azimuth of the sound: that of the corner, roughly, while the corner hides the vehicle."""
     if time_s < IN_VIEW_S:
         return math.radians(50.0)
     return CORNER_RAD + TURNING_RAD_S * (time_s - IN_VIEW_S)
 
 
 def sound(array: MicrophoneArray, first_s: float, rng: np.random.Generator) -> np.ndarray:
-    """Return 0.1 s of a noisy vehicle among other noise, shape (n, M)."""
+    """Return 0.1 s of sound of a vehicle with noise, shape (n, M)."""
     n = RATE_HZ // 10
     frequency_hz = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
     spectrum = np.fft.rfft(rng.normal(size=n)) * (frequency_hz < 3000.0)
@@ -147,7 +144,7 @@ def sound(array: MicrophoneArray, first_s: float, rng: np.random.Generator) -> n
 
 
 def image(time_s: float) -> np.ndarray:
-    """Return what the camera sees: a bright block where the vehicle is, once it is in view."""
+    """Return an image with a bright block at the vehicle, if it is in view."""
     width_px, height_px = IMAGE_PX
     frame = np.zeros((height_px, width_px, 3), dtype=np.uint8)
     if time_s >= IN_VIEW_S:
@@ -158,10 +155,10 @@ def image(time_s: float) -> np.ndarray:
 
 
 def run(duration_s: float = 6.0, seed: int = 1) -> Iterator[WorldState]:
-    """Yield the world-state after every tenth of a second, from the first full one on."""
+    """Yield the world-state of every hop of 0.1 s."""
     array, camera, rng = my_array(), LiveCamera(BrightBlocks()), np.random.default_rng(seed)
     adapter = AcousticAdapter(array, RATE_HZ, PatternSignature(), vision=camera)
-    # Assumed: an advisory from P(hidden) = 0.8 on. No budget of false alarms was measured for it.
+    # Assumed: an advisory begins at P(hidden) = 0.8. No false-alarm rate was measured for it.
     world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=0.8))
     for hop in range(round(duration_s * 10)):
         camera.look(image((hop + 1) / 10))
@@ -172,7 +169,7 @@ def run(duration_s: float = 6.0, seed: int = 1) -> Iterator[WorldState]:
 
 
 def main() -> None:
-    """Print what is believed twice a second."""
+    """Print the state twice per second."""
     for state in run():
         if state.seq % 5 == 0:
             entities = ", ".join(

@@ -1,4 +1,4 @@
-"""A place behind the corner, for known walls and array: python docs/examples/place.py."""
+"""Position of a vehicle behind a corner, for known walls: python docs/examples/place.py."""
 
 import numpy as np
 from worldstate_lab.places.place_filter import PlaceFilter, added_position
@@ -15,14 +15,14 @@ MODEL = SpectrumModel.of(StreetWalls(4.5, 2.8, 2.8, 7.2), ARRAY, AZIMUTHS, HZ)
 
 
 def behind_the_corner(hops: int) -> WorldState:
-    """Return what is known of a vehicle on the left, heard off the right wall and round the corner."""
+    """Return the state for a vehicle on the left: its sound comes off the right wall and the corner."""
     world, places = WorldFilter(), PlaceFilter(MODEL)
     waves = ARRAY.steering(HZ, np.radians([-59.0, 32.0])) * [1.0, 0.3]
-    heard = (np.abs(ARRAY.steering(HZ, AZIMUTHS).conj().transpose(0, 2, 1) @ waves) ** 2).sum(axis=(0, 2))
+    power = (np.abs(ARRAY.steering(HZ, AZIMUTHS).conj().transpose(0, 2, 1) @ waves) ** 2).sum(axis=(0, 2))
     belief = carried = places.unknown
     for hop in range(1, hops + 1):
-        belief, carried = places.update(places.predict(belief, 0.1), heard), places.predict(carried, 0.1)
-        # Once a second, what it has added: no spectrum counts twice.
+        belief, carried = places.update(places.predict(belief, 0.1), power), places.predict(carried, 0.1)
+        # Once per second, only the new information is added, so that no spectrum is used twice.
         if hop % 10 == 0:
             found = added_position(places.estimate(belief), places.estimate(carried), MODEL.walls.crossing_m)
             if found is not None:

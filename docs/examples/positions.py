@@ -1,4 +1,4 @@
-"""Radar and V2X: positions and velocities with their covariance, and a vehicle that no sensor sees.
+"""Radar and V2X: positions and velocities with covariance, and a vehicle that no sensor detects.
 
 python docs/examples/positions.py
 """
@@ -8,13 +8,13 @@ import math
 from worldstate import WorldFilter, WorldState
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 
-# 0.5 m and 0.3 m/s, as of a good satellite receiver or a front radar.
+# Standard deviations of 0.5 m and 0.3 m/s, as of a good satellite receiver or a front radar.
 NOISE = tuple(tuple(std**2 * (i == j) for j in range(4)) for i, std in enumerate((0.5, 0.5, 0.3, 0.3)))
 FRONT_RADAR = SearchedSector(Sector(0.0, math.radians(60.0)), range_m=70.0, detection_probability=0.9)
 
 
 def radar_alone(scans: int) -> WorldState:
-    """Return what is known of a car ahead that comes closer at 4 m/s; at the fifth scan it is missed."""
+    """Return the state for a car ahead that approaches at 4 m/s; the fifth scan misses it."""
     world = WorldFilter()
     for scan in range(1, scans + 1):
         car = Position((30.0 - 0.4 * scan, 2.0), NOISE, velocity_mps=(-4.0, 0.0))
@@ -24,7 +24,7 @@ def radar_alone(scans: int) -> WorldState:
 
 
 def announced(messages: int) -> WorldState:
-    """Return what is known of a car on the cross street, hidden by the corner, that tells where it is."""
+    """Return the state for a car behind the corner that sends its position."""
     world = WorldFilter()
     for hop in range(1, messages + 1):
         car = Position((10.0, 31.0 - 0.8 * hop), NOISE, (0.0, -8.0), 0.95, (("car", 1.0),))

@@ -18,14 +18,14 @@ RECEIVER = LinearGaussian(ndim_state=4, mapping=(0, 2), noise_covar=np.diag([0.2
 
 
 def detector() -> Iterator[tuple[datetime, set[Detection]]]:
-    """Yield a car on the cross street, hidden by the corner, as a Stone Soup detector yields it."""
+    """Yield the detections of a car behind the corner, as a detector of Stone Soup does."""
     for hop in range(1, 21):
         time = START + timedelta(seconds=0.1 * hop)
         yield time, {Detection([10.0, 31.0 - 0.8 * hop], timestamp=time, measurement_model=RECEIVER)}
 
 
 def scan(time: datetime, detections: set[Detection]) -> PositionScan:
-    """Return what was detected at one time; x forward and y left, metres."""
+    """Return the detections of one time as positions; x forward and y left, metres."""
     found = list[Position]()
     for one in detections:
         x_m, y_m = map(float, one.state_vector)

@@ -1,13 +1,13 @@
-"""A second modality: cooperative V2X beacons, heard round the corner and checked against the camera.
+"""A second modality: V2X beacons that a camera checks.
 
-A vehicle that is equipped says ten times a second where it is and how fast it drives. The radio carries round
-a corner, but the corner costs power; and anybody can claim anything. So a beacon plays the part that sound
-plays elsewhere: its signature is the received power against what the claimed range would give, its
-co-evidence is the object that the camera should see where the beacon says that it is. Nothing in `abduction`
-knows of radio: it is given log-likelihoods and an answer.
+An equipped vehicle sends its position and speed ten times per second. Its radio signal passes a corner with a
+loss of power, and anybody can send a false position. A beacon is therefore evidence like sound: its signature
+is the received power, compared with the power at the claimed distance. Its co-evidence is the object that the
+camera should see at the claimed position. `abduction` needs only log-likelihoods and the answer of the
+camera.
 
-Windows of sound repeat one another, and the filter takes what is new in their posterior. Every beacon has an
-error of its own once the vehicle has moved on by some metres, so that beacons are multiplied instead.
+The errors of two beacons are independent after the vehicle has moved by some metres, so their likelihoods are
+multiplied.
 
 Run it:
 
@@ -35,10 +35,10 @@ from worldstate.abduction import uncalibrated_policy
 from worldstate.measurement import Approach, Bearing, CoEvidenceChannel
 
 DIRECTIONS = ("left", "right")
-# Assumed: shadowing repeats for 0.3 s, 2 m at the pace of a side street.
+# Assumed: shadowing is the same for 0.3 s, which is 2 m at the speed in a side street.
 SETTINGS = FilterSettings(windows="likelihood", window_s=0.3)
 
-# What each kind of station should look like to a camera; a person in a car park need not be seen at all.
+# Labels that a detector should give each kind of station; a pedestrian need not be visible at all.
 EXPECTED_LABELS: dict[str, Collection[str]] = {
     "passenger car": {"car"},
     "truck": {"truck", "bus"},
@@ -49,7 +49,7 @@ EXPECTED_LABELS: dict[str, Collection[str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Beacon:
-    """One cooperative message, in `base_link`, with the power that it arrived with.
+    """One V2X message in `base_link`, with its received power.
 
     Parameters
     ----------
@@ -86,13 +86,12 @@ class Beacon:
 
 @dataclass(frozen=True, slots=True)
 class RadioSignature:
-    """Likelihood of a beacon under every explanation.
+    """Likelihood of a beacon under each explanation.
 
-    The excess loss over free space is Gaussian: about `corner_loss_db` behind a corner, about zero in plain
-    view. Without a vehicle the beacon is a ghost, replayed or forged: its power goes with its claim only by
-    chance and spreads over `ghost_range_db`, its azimuth over the half-plane ahead. The claimed azimuth of a
-    vehicle is that of an occluded approach, or of the view. How rare ghosts are is a matter of the context's
-    rates and not of any one beacon.
+    The loss above that of free space is Gaussian: with a mean of `corner_loss_db` behind a corner and 0 in
+    view. Without a vehicle, the beacon is replayed or forged: its power is uniform over `ghost_range_db`,
+    and its azimuth is uniform over the half-plane ahead. The azimuth of a hidden vehicle is Gaussian
+    about that of an occluded approach. The rate of forged beacons is part of the context.
     """
 
     transmit_dbm: float = 23.0
@@ -124,14 +123,14 @@ class RadioSignature:
 
 
 class BeaconAdapter:
-    """Turns beacons into measurements; a `MeasurementAdapter` of lists of beacons.
+    """Convert beacons to measurements: a `MeasurementAdapter` for lists of beacons.
 
     Parameters
     ----------
     signature : RadioSignature, optional
-        How radio behaves here.
+        Model of the received power.
     vision : CoEvidenceChannel, optional
-        Asked where the beacon says that its sender is.
+        Camera that checks the claimed position.
     """
 
     def __init__(
@@ -142,11 +141,11 @@ class BeaconAdapter:
         self._vision = vision
 
     def measure(self, beacons: list[Beacon], /) -> list[Measurement]:
-        """Return a measurement a beacon, oldest first."""
+        """Return one measurement per beacon, oldest first."""
         return [self._interpret(beacon) for beacon in sorted(beacons, key=lambda beacon: beacon.stamp_ns)]
 
     def _interpret(self, beacon: Beacon) -> Measurement:
-        # Two metres of positioning error at the claimed range.
+        # The standard deviation corresponds to an error of 2 m at the claimed range.
         bearing = Bearing(beacon.azimuth_rad, math.atan2(2.0, max(beacon.range_m, 2.0)))
         sightings = self._vision.sightings(beacon.stamp_ns) if self._vision else ()
         return Measurement(
@@ -162,7 +161,7 @@ class BeaconAdapter:
     def _ask(self, beacon: Beacon, bearing: Bearing) -> Absent | Present | Unqueried:
         expected = EXPECTED_LABELS.get(beacon.station, ())
         if self._vision is None or not expected:
-            return Unqueried("no camera, or nothing that it should see")
+            return Unqueried("no camera, or no visible object expected")
         return self._vision.ask(beacon.stamp_ns, bearing, expected)
 
 
@@ -178,7 +177,7 @@ def _log_gaussian(value: float, mean: float, std: float) -> float:
 
 
 class ScriptedCamera:
-    """A camera of 36 deg to either side that sees the vehicle from `t0_s` on, and nothing else."""
+    """A camera of 36 degrees to each side that detects the vehicle from `t0_s` on, and nothing else."""
 
     def __init__(self, beacons: list[Beacon], t0_s: float, miss_rate: float = 0.04) -> None:
         self._seen = {b.stamp_ns: b.azimuth_rad for b in beacons if b.stamp_ns >= nanoseconds(t0_s)}
@@ -191,9 +190,9 @@ class ScriptedCamera:
         expected_labels: Collection[str] | None = None,
         side: str | None = None,
     ) -> Absent | Present | Unqueried:
-        """Answer for ten degrees around the bearing."""
+        """Return whether a car is within ten degrees of the bearing."""
         if isinstance(bearing, NotUsable) or abs(bearing.azimuth_rad) > 0.62:
-            # A hidden vehicle is beyond the edge: what could be seen of it stands in line of sight.
+            # A hidden vehicle is outside the view, and the camera finds nothing in the line of sight.
             return Absent(self._miss_rate, 0.01)
         azimuth = self._seen.get(stamp_ns)
         there = azimuth is not None and abs(azimuth - bearing.azimuth_rad) < 0.17
@@ -201,12 +200,12 @@ class ScriptedCamera:
         return Present(self._miss_rate, 0.01) if there else Absent(self._miss_rate, 0.01)
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:
-        """Return the vehicle once it is in view."""
+        """Return the vehicle if it is in view."""
         azimuth = self._seen.get(stamp_ns)
         return () if azimuth is None else (Sighting(azimuth, 0.03, "car", 0.9, 0.1),)
 
     def last_look(self, stamp_ns: int) -> None:
-        """Every answer is a look of its own: no camera here is asked by two sources."""
+        """Return None: every answer is a new image, because only one source queries this camera."""
 
 
 def approach_from_left(duration_s: float = 6.0, t0_s: float = 4.0) -> list[Beacon]:
@@ -227,7 +226,7 @@ def run(
     beacons: list[Beacon], camera: CoEvidenceChannel | None, settings: FilterSettings = SETTINGS
 ) -> Iterator[WorldState]:
     """Yield the world-state after every beacon."""
-    # A threshold of this modality's own; a budget would have to be calibrated for it.
+    # Assumed: no false-alarm rate was measured for this threshold.
     world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=0.7), settings=settings)
     for measurement in BeaconAdapter(vision=camera).measure(beacons):
         world = world.predict_to(measurement.stamp_ns).update(measurement)
@@ -235,7 +234,7 @@ def run(
 
 
 def main() -> None:
-    """Print what is believed of one approach."""
+    """Print the states of one approach."""
     beacons = approach_from_left()
     for state in run(beacons, ScriptedCamera(beacons, t0_s=4.0)):
         if state.seq % 5 == 0:

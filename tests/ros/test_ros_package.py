@@ -220,7 +220,7 @@ def test_a_bag_that_is_played_again_begins_again(node_of, parameters, heard):
     stamps = [one["stamp_ns"] for one in states_of(node)]
     assert len(stamps) % 2 == 0
     assert stamps[: len(stamps) // 2] == stamps[len(stamps) // 2 :]
-    assert node.said == ["audio: stamps or rate begin again, and so do the states"]
+    assert node.said == ["audio: stamps went back or the rate changed; the states start again"]
 
 
 @pytest.mark.long

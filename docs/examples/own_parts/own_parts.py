@@ -1,4 +1,4 @@
-"""Five parts of one's own, each in some twenty lines; pyproject.toml says by which names they are found."""
+"""Five parts of your own in about twenty lines each; pyproject.toml registers their names."""
 
 import csv
 import json
@@ -20,7 +20,7 @@ def my_array() -> MicrophoneArray:
 
 
 class MovingColumns:
-    """A detector: the columns in which an image differs from the one before belong to one car."""
+    """A detector: all columns in which an image differs from the previous one belong to one car."""
 
     def __init__(self) -> None:
         self._before: np.ndarray | None = None
@@ -37,19 +37,20 @@ class MovingColumns:
 
 
 class BeaconAdapter:
-    """A measurement adapter: lines of JSON, each a message of a vehicle that says where it is."""
+    """A measurement adapter for lines of JSON, each with the position of a vehicle."""
 
     source = "v2x"
 
     def measure(self, line: str, /) -> list[PositionScan]:
-        """Return the position that a message states, with 1 m of standard deviation."""
-        said = json.loads(line)
-        place = Position((said["x_m"], said["y_m"]), ((1.0, 0.0), (0.0, 1.0)), existence_probability=0.95)
-        return [PositionScan(self.source, said["stamp_ns"], (place,))]
+        """Return the position of a message, with a standard deviation of 1 m."""
+        message = json.loads(line)
+        place_m = message["x_m"], message["y_m"]
+        place = Position(place_m, ((1.0, 0.0), (0.0, 1.0)), existence_probability=0.95)
+        return [PositionScan(self.source, message["stamp_ns"], (place,))]
 
 
 def read_v2x(path: Path) -> Iterator[PositionScan]:
-    """Yield what a log of such messages says."""
+    """Yield the positions of a log of such messages."""
     adapter = BeaconAdapter()
     with path.open(encoding="utf-8") as log:
         for line in log:
@@ -57,13 +58,13 @@ def read_v2x(path: Path) -> Iterator[PositionScan]:
 
 
 class LoudSide:
-    """A signature model: where the steered power is highest, and by how much, nats.
+    """A signature model that uses the position and the height of the peak of the steered power.
 
-    The feature is the steered power at thirty azimuths from left to right, of either half of the last second.
+    The feature is the steered power at thirty azimuths from left to right, for each half of the last second.
     """
 
     def evidence(self, feature: np.ndarray) -> SignatureEvidence:
-        """Return log-likelihoods of one window: hidden on either side, visible, none."""
+        """Return log-likelihoods of one window in nats: hidden on each side, visible, none."""
         pattern = feature.reshape(2, 30)[1]
         sounding = float(pattern.max() / np.median(pattern)) - 4.0
         share = float(pattern.argmax()) / 29.0
@@ -73,7 +74,7 @@ class LoudSide:
 
 @contextmanager
 def risk_table(target: str) -> Iterator[Callable[[WorldState], None]]:
-    """Open an exporter: risk and advisory of every side, and whether they may be acted on, as CSV."""
+    """Open an exporter that writes risk, advisory and usability of every side as CSV."""
     with Path(target).open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(["time_s", "side", "risk", "advisory", "usable", "why_not"])

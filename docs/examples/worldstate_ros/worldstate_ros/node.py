@@ -26,16 +26,16 @@ from worldstate.adapters.ros.bag_writer import risk_advisories, scene_markers
 from worldstate.adapters.ros.message_types import stamp_of
 from worldstate.measurement.odometry import EgoPose
 
-# So much of a loss is heard as silence, so that the states show it; time goes on by the rest.
+# At most this part of a loss is replaced by silence, so that the states show it; the rest is skipped.
 HEARD_NS = 900_000_000
-# A stamp that goes back by more is that of another run: a bag that is played again, or a simulated clock.
+# A stamp that is earlier by more belongs to another run: a repeated bag, or a simulated clock.
 AGAIN_NS = 2_000_000_000
-# A delay that is not in all of so many messages in a row is jitter of the transport, and no loss.
+# A delay that is not in this number of consecutive messages is jitter of the transport, and no loss.
 MESSAGES = 5
 
 
 class SampleClock:
-    """The time of samples that come in messages: counted from the first stamp, corrected by later ones.
+    """The time of samples in messages: the first stamp plus the samples, corrected by later stamps.
 
     Parameters
     ----------
@@ -59,14 +59,14 @@ class SampleClock:
         self._late_ns: deque[int] = deque([0] * MESSAGES, maxlen=MESSAGES)
 
     def goes_back(self, stamp_ns: int) -> bool:
-        """Return whether a stamp is of another run."""
+        """Return whether a stamp belongs to another run."""
         return stamp_ns < self._last_ns - AGAIN_NS
 
     def moved_by(self, stamp_ns: int, length_ns: int) -> int:
-        """Count a message; return how much sound was lost before it, ns.
+        """Add a message; return the length of the sound that was lost before it, ns.
 
-        It is 0 for less than half a message, and minus the length of the message if that is one too many: the
-        converter is faster than the clock of the stamps.
+        It is 0 for less than half a message. It is minus the length of the message if the message has to be
+        left out, because the converter is faster than the clock of the stamps.
         """
         self._last_ns = stamp_ns
         self._late_ns.append(stamp_ns - self.next_ns)
@@ -80,14 +80,14 @@ class SampleClock:
         return moved_ns
 
     def time_ns(self, stamp_ns: int) -> int:
-        """Return the time by the samples of another sensor's stamp."""
+        """Return the time of another sensor's stamp on the clock of the samples."""
         return stamp_ns - min(self._late_ns)
 
 
 class WorldStateNode(Node):
-    """Publishes what stands in each world-state, ten times a second.
+    """Publish each world-state, ten times per second.
 
-    The time of the states is that of the stamps of the sound. Sound waits `wait_s` for the boxes of its time.
+    States have the time of the stamps of the sound. Sound waits `wait_s` for the boxes of its time.
     """
 
     def __init__(self) -> None:
@@ -109,7 +109,7 @@ class WorldStateNode(Node):
         self._objects = self.create_publisher(PredictedObjects, "~/objects", 10)
         self._markers = self.create_publisher(MarkerArray, "~/markers", 10)
         self._snapshots = self.create_publisher(String, "~/snapshot", 10)
-        # Seconds of sound may come at once after a stall; drivers differ in whether they send again.
+        # After a stall, seconds of sound may arrive at once; some drivers repeat messages and some do not.
         quality = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self.create_subscription(MultiChannelAudio, "audio", self.on_audio, quality)
         if given["camera"]:
@@ -121,7 +121,7 @@ class WorldStateNode(Node):
         return self.declare_parameter(name, default).value
 
     def on_audio(self, message: MultiChannelAudio) -> None:
-        """Take a block of sound; hear what has waited long enough."""
+        """Queue a block of sound; process the blocks that have waited long enough."""
         stamp_ns, rate_hz = stamp_of(message.header), int(message.sample_rate)
         samples = np.asarray(message.data, dtype=np.float32)
         if not rate_hz or not message.channels or len(samples) % message.channels:
@@ -145,9 +145,9 @@ class WorldStateNode(Node):
             self._hear(samples)
 
     def _begin(self, stamp_ns: int, rate_hz: int) -> None:
-        """Listen from a stamp on, with nothing of what was before."""
+        """Start a new listener at a stamp."""
         if self._listener is not None:
-            self.get_logger().warning("audio: stamps or rate begin again, and so do the states")
+            self.get_logger().warning("audio: stamps went back or the rate changed; the states start again")
         start_s = 1e-9 * stamp_ns
         self._listener = worldstate.Listener(
             self._array, rate_hz, start_s=start_s, moving_ego=self._moving, **self._parts
@@ -163,7 +163,7 @@ class WorldStateNode(Node):
             self._refuse(f"audio: {error}")
 
     def on_detections(self, message: Detection2DArray) -> None:
-        """Take the boxes of an image; one without boxes was searched, too."""
+        """Pass on the boxes of an image, also of one without boxes, because it was searched."""
         try:
             if self._listener is not None:
                 taken_ns = self._clock.time_ns(stamp_of(message.header))
@@ -172,7 +172,7 @@ class WorldStateNode(Node):
             self._refuse(f"detections: {error}")
 
     def on_odometry(self, message: Odometry) -> None:
-        """Take speed and yaw rate, and of the frame of the map the pose."""
+        """Pass on speed and yaw rate, and the pose if the frame is the map."""
         try:
             if self._listener is not None:
                 twist, at_ns = message.twist.twist, self._clock.time_ns(stamp_of(message.header))
@@ -188,16 +188,16 @@ class WorldStateNode(Node):
             self._listener.refuse(1)
 
     def publish(self, state: worldstate.WorldState) -> None:
-        """Publish a state: an advisory is never a command."""
+        """Publish a state."""
         self._advisories.publish(_filled(RiskAdvisories, risk_advisories(state)))
         self._markers.publish(_filled(MarkerArray, scene_markers(state)))
         self._snapshots.publish(_filled(String, {"data": state.to_json()}))
-        if is_localised(state):  # Autoware's objects stand in the map
+        if is_localised(state):  # Autoware's objects are in the map
             self._objects.publish(_filled(PredictedObjects, autoware_objects(state, self._crossing_m)))
 
 
 def _pose(pose: Any) -> EgoPose:
-    """Return where a pose stands in the plane, and its yaw."""
+    """Return the position of a pose in the plane, and its yaw."""
     turn = pose.orientation
     yaw_rad = math.atan2(2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2))
     return EgoPose((pose.position.x, pose.position.y), yaw_rad)
