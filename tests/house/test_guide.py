@@ -1,8 +1,9 @@
-"""The pages of docs/guide run as they are printed, and what they print is what stands on them.
+"""The commands and programs of the pages of docs/guide run, and their output is that of the page.
 
-A `console` block holds commands after `$ ` and their output below them, a `python` block a program whose
-output stands in the `text` block after it; `...` stands for any text. A `code-block` with a caption is the
-file of that name. Commands run from top to bottom in a folder that holds what `worldstate demo` leaves.
+A `console` block contains commands after `$ ` and their output below them. A `python` block contains a
+program, and the `text` block after it contains the output. `...` matches any text. A `code-block` with a
+caption is the file of that name. Commands run from top to bottom in a folder with the output of `worldstate
+demo`.
 """
 
 import contextlib
@@ -30,11 +31,11 @@ from worldstate.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs" / "guide").glob("*.md"))
-# The fixture has done what `worldstate demo` does, in seven seconds of processor time.
+# The fixture has already run `worldstate demo`, which takes seven seconds of processor time.
 PREPARED = ("worldstate demo ",)
-# A quick `model make` takes two minutes of processor time, and the commands after it need its model.
+# A quick `model make` takes two minutes of processor time, and later commands need its model.
 SLOW = ("model_for_an_array",)
-# Sound card, camera and detector are stand-ins, which give the demo's recording.
+# Substitutes play the recording of the demo as sound card, camera and detector.
 LIVE = ("live_in_python",)
 FENCE = re.compile(
     r"^```(console|python|text|\{code-block\})(?: \w+\n:caption: (\S+)\n)?\n(.*?)^```$", re.M | re.S
@@ -43,7 +44,7 @@ COMMAND = re.compile(r"^\$ ((?:.*\\\n)*.*)\n((?:(?!\$ ).*\n)*)", re.M)
 
 
 def steps(text: str) -> Iterator[tuple[str, str, str]]:
-    """Yield the steps of a page: kind, text, and what it prints (of a file its name)."""
+    """Yield the steps of a page: kind, text, and output (of a file its name)."""
     blocks = FENCE.findall(text)
     for (kind, name, body), (after, _, printed) in zip(blocks, [*blocks[1:], ("", "", "")], strict=True):
         if kind == "console":
@@ -56,7 +57,7 @@ def steps(text: str) -> Iterator[tuple[str, str, str]]:
 
 @contextlib.contextmanager
 def everything_printed() -> Iterator[io.StringIO]:
-    """Lend what is printed, and logged warnings: a terminal shows these, pytest takes them away."""
+    """Capture output and logged warnings: a terminal shows both, but pytest hides the warnings."""
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
         logged = logging.StreamHandler(out)
         logged.setLevel(logging.WARNING)
@@ -68,7 +69,7 @@ def everything_printed() -> Iterator[io.StringIO]:
 
 
 def output_of(kind: str, text: str, printed: str) -> str:
-    """Do one step in the current folder; return what it printed."""
+    """Run one step in the current folder; return its output."""
     if kind == "file":
         Path(printed).write_text(text, encoding="utf-8")
         return printed
@@ -79,14 +80,14 @@ def output_of(kind: str, text: str, printed: str) -> str:
     with everything_printed() as out:
         if kind == "python":
             exec(compile(text, "program of the page", "exec"), {"__name__": "__main__"})
-        # A refusal on a page is shown as such.
+        # A page may show an error message.
         elif (code := main(words[1:])) and not printed.startswith("worldstate: "):
             raise AssertionError(f"{text} ended with {code}: {out.getvalue()}")
     return out.getvalue()
 
 
 def without_margins(text: str) -> str:
-    # A slow machine is told how far a command has come.
+    # Commands print their progress on a slow machine.
     text = re.sub(r"^worldstate: .* % after \d+ s(, some \d+ s left)?\n", "", text, flags=re.M)
     return "\n".join(line.rstrip() for line in text.strip("\n").splitlines()) + "\n"
 
@@ -94,7 +95,7 @@ def without_margins(text: str) -> str:
 def expect_as_printed(step: tuple[str, str, str]) -> None:
     got, printed = without_margins(output_of(*step)), without_margins(step[2])
     alike = printed == got or doctest.OutputChecker().check_output(printed, got, doctest.ELLIPSIS)
-    assert alike, f"{step[1]}\nprinted\n{got}\nand the page has\n{printed}"
+    assert alike, f"{step[1]}\nprinted\n{got}\nand the page shows\n{printed}"
 
 
 @pytest.fixture(scope="session")
@@ -112,7 +113,7 @@ def marked(page: Path) -> object:
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", [*map(marked, PAGES)])
-def test_a_page_runs_and_prints_what_stands_on_it(page, desk, tmp_path, monkeypatch):
+def test_commands_of_a_page_print_its_output(page, desk, tmp_path, monkeypatch):
     shutil.copytree(desk, tmp_path / "desk", copy_function=os.link)
     monkeypatch.chdir(tmp_path / "desk")
     if page.stem in LIVE:
@@ -123,7 +124,7 @@ def test_a_page_runs_and_prints_what_stands_on_it(page, desk, tmp_path, monkeypa
 
 
 def results_of_supervision():
-    """Return what makes results of supervision: a twin, and the package itself if it is installed."""
+    """Return two sources of detections: a substitute, and supervision itself if it is installed."""
     twin = SimpleNamespace(Detections=lambda **parts: SimpleNamespace(**({"data": {}} | parts)))
     real = pytest.param(None, marks=pytest.mark.skipif(not find_spec("supervision"), reason="no supervision"))
     return [twin, real]
@@ -143,14 +144,14 @@ def test_boxes_of_supervision_become_those_of_an_image(package, n):
     assert frame.labels == ("car",) * n
 
 
-@pytest.mark.slow
-def test_the_demo_prints_what_stands_on_the_first_page(tmp_path, monkeypatch):
+@pytest.mark.long
+def test_the_demo_prints_the_output_of_the_first_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     expect_as_printed(next(steps((ROOT / "docs" / "guide" / "first_program.md").read_text(encoding="utf-8"))))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_page_teaches_one_task_briefly(page):
+def test_a_page_is_short_and_has_one_table(page):
     lines = page.read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 120
     assert [line for line in lines if len(line) > 140 and not line.startswith("|")] == []

@@ -1,4 +1,4 @@
-"""The tutorials run, and their pages show what they print and draw."""
+"""The tutorials and the notebook run, and their pages show their output and figures."""
 
 import ast
 import json
@@ -24,7 +24,7 @@ def first_lines(script):
     return [line for n, line in lines if n not in skipped and line.strip() and line.strip()[0] != "#"]
 
 
-def test_there_are_seven_and_the_index_lists_them():
+def test_the_index_lists_all_seven_tutorials():
     assert [script.stem[:2] for script in SCRIPTS] == [f"0{n}" for n in range(1, 8)]
     index = (FOLDER / "index.md").read_text(encoding="utf-8")
     assert [script.stem for script in SCRIPTS if f"({script.stem}.md)" not in index] == []
@@ -35,21 +35,21 @@ def test_there_are_seven_and_the_index_lists_them():
     "script",
     [pytest.param(one, id=one.stem, marks=[pytest.mark.slow] * (one.stem in SLOW)) for one in SCRIPTS],
 )
-def test_a_tutorial_prints_what_its_page_shows(script, tmp_path, monkeypatch, capsys):
+def test_a_tutorial_prints_the_output_of_its_page(script, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(script), run_name="__main__")
     printed = capsys.readouterr().out
     (shown,) = re.findall(r"```text\n(.*?)```", script.with_suffix(".md").read_text(encoding="utf-8"), re.S)
     assert re.sub(NUMBER, "#", printed) == re.sub(NUMBER, "#", shown)
-    # Other processors add in another order, so that the last digit may differ.
+    # Other processors add in another order, so the last digit may differ.
     numbers = [list(map(float, re.findall(NUMBER, text))) for text in (printed, shown)]
     assert numbers[0] == pytest.approx(numbers[1], rel=0.05, abs=0.05)
     assert (tmp_path / "out" / "tutorials" / f"{script.stem}.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_a_page_begins_with_few_lines_and_ends_in_its_figure(script):
+def test_a_page_begins_with_few_lines_and_ends_with_its_figure(script):
     page = script.with_suffix(".md").read_text(encoding="utf-8")
     first = first_lines(script)
     assert len(first) <= 12
@@ -67,7 +67,7 @@ def printed_by(notebook) -> list[str]:
 
 
 @pytest.mark.long
-def test_the_notebook_prints_what_it_shows():
+def test_the_notebook_prints_its_stored_output():
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     path = FOLDER / "first_sound.ipynb"
