@@ -13,25 +13,23 @@ from worldstate.adapters.camera.detections import read_detections
 
 
 class Tensor:
-    """A tensor of a graphics card: numbers only after `cpu` and `numpy`, as torch has it."""
+    """A tensor of a graphics card: an array only after `cpu`, as in torch."""
 
     def __init__(self, values):
         self._values = values
 
     def cpu(self):
-        return SimpleNamespace(numpy=lambda: self._values)
+        return self._values
 
 
 class Results:
-    """What ultralytics returns of an image: `names`, and `boxes` that `cpu` and `numpy` make arrays."""
+    """What ultralytics returns of an image: `names`, and tensors of `boxes`."""
 
     def __init__(self, frame, names):
         self.names = dict(enumerate(names))
         numbers = np.array([names.index(label) for label in frame.labels], dtype=np.float32)
-        arrays = SimpleNamespace(
-            xyxy=frame.boxes_px.astype(np.float32), conf=frame.scores.astype(np.float32), cls=numbers
-        )
-        self.boxes = Tensor(arrays)
+        corners, scores = frame.boxes_px.astype(np.float32), frame.scores.astype(np.float32)
+        self.boxes = SimpleNamespace(xyxy=Tensor(corners), conf=Tensor(scores), cls=Tensor(numbers))
 
 
 class Street:

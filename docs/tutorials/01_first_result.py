@@ -12,8 +12,8 @@ listener = Listener(ovad_array(), street.sample_rate_hz)
 states = [state for block in np.array_split(sound, 1000) for state in listener.push(block)]
 for state in states:
     for cue in state.cues:
-        if cue.advisory and cue.advisory.since_ns == state.stamp_ns:
-            print(f"{state.stamp_ns / 1e9:.1f} s: advisory {cue.direction}, risk {cue.risk:.2f}")
+        if cue.began:
+            print(f"{state.time_s:.1f} s: advisory {cue.direction}, risk {cue.risk:.2f}")
 
 # The figure: the same street with and without a vehicle.
 from dataclasses import replace

@@ -14,7 +14,7 @@ for hop, noise in enumerate(np.random.default_rng(5).normal(size=40).tolist()):
     world = world.update(Measurement(stamp_ns, light, Unqueried("no camera"), no_sound, no_sound))
     states.append(world.state)
 for state in states[3::5]:
-    print(f"{state.stamp_ns / 1e9:.1f} s:", *(f"risk {cue.direction} {cue.risk:.2f}" for cue in state.cues))
+    print(f"{state.time_s:.1f} s:", *(f"risk {cue.direction} {cue.risk:.2f}" for cue in state.cues))
 
 # The figure: the risk of both sides while the wall is bright.
 from tutorial_figures import draw_sides, tutorial_figure

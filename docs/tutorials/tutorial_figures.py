@@ -30,7 +30,7 @@ def draw_sides(
     read: Callable[[RiskCue], float] = chance,
 ) -> None:
     """Draw a probability of both sides, shaded during an advisory, and the true time of coming into view."""
-    time_s = [state.stamp_ns / 1e9 for state in states]
+    time_s = [state.time_s for state in states]
     for cues, dashes in zip(zip(*(state.cues for state in states), strict=True), SIDE_DASHES, strict=False):
         values, on = [read(cue) for cue in cues], [cue.advisory is not None for cue in cues]
         axes.plot(time_s, values, dashes, color=HIDDEN, label=cues[0].direction)

@@ -17,16 +17,11 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from stand_ins import stand_in
 
-import worldstate
 from worldstate.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -121,27 +116,6 @@ def test_commands_of_a_page_print_its_output(page, desk, tmp_path, monkeypatch):
     for step in steps(page.read_text(encoding="utf-8")):
         if not step[1].startswith(PREPARED):
             expect_as_printed(step)
-
-
-def results_of_supervision():
-    """Return two sources of detections: a substitute, and supervision itself if it is installed."""
-    twin = SimpleNamespace(Detections=lambda **parts: SimpleNamespace(**({"data": {}} | parts)))
-    real = pytest.param(None, marks=pytest.mark.skipif(not find_spec("supervision"), reason="no supervision"))
-    return [twin, real]
-
-
-@pytest.mark.parametrize("package", results_of_supervision(), ids=["twin", "supervision"])
-@pytest.mark.parametrize("n", [0, 1, 3])
-def test_boxes_of_supervision_become_those_of_an_image(package, n):
-    package = package or import_module("supervision")
-    page = (ROOT / "docs" / "guide" / "live_in_python.md").read_text(encoding="utf-8")
-    given = {"worldstate": worldstate}
-    exec(next(text for kind, text, _ in steps(page) if kind == "python" and "def frame_of" in text), given)
-    boxes, scores = np.arange(4.0 * n, dtype=np.float32).reshape(n, 4), np.linspace(0.1, 0.9, n)
-    names = {"data": {"class_name": np.array(["car"] * n)}} if n else {}
-    frame = given["frame_of"](package.Detections(xyxy=boxes, confidence=scores, **names))
-    assert (frame.boxes_px.tolist(), frame.scores.tolist()) == (boxes.tolist(), scores.tolist())
-    assert frame.labels == ("car",) * n
 
 
 @pytest.mark.long
