@@ -16,4 +16,4 @@ for name in ("auroc_last_second", "approaches", "detected", "onsets_high"):
     print(f"{name}: {exam_figures(examined)[name]:.2f}")
 
 # The figure: the exam at a junction that the model did not learn.
-write_exam_figure(examined, Path("out/tutorials/04_commission.png"))
+write_exam_figure(examined, Path("out/tutorials/04_commission.svg"))

@@ -13,7 +13,7 @@ from worldstate.state import RiskCue
 
 def tutorial_figure(script: str, width_in: float, height_in: float) -> AbstractContextManager[Any]:
     """Return an empty figure that is saved in out/tutorials under the name of the script."""
-    path = Path("out/tutorials", Path(script).stem + ".png")
+    path = Path("out/tutorials", Path(script).stem + ".svg")
     path.parent.mkdir(parents=True, exist_ok=True)
     return figure_file(path, width_in, height_in)
 

@@ -45,7 +45,7 @@ def test_a_tutorial_prints_the_output_of_its_page(script, tmp_path, monkeypatch,
     # Other processors add in another order, so the last digit may differ.
     numbers = [list(map(float, re.findall(NUMBER, text))) for text in (printed, shown)]
     assert numbers[0] == pytest.approx(numbers[1], rel=0.05, abs=0.05)
-    assert (tmp_path / "out" / "tutorials" / f"{script.stem}.png").stat().st_size > 10_000
+    assert (tmp_path / "out" / "tutorials" / f"{script.stem}.svg").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
@@ -56,8 +56,8 @@ def test_a_page_begins_with_few_lines_and_ends_with_its_figure(script):
     assert any("print(" in line for line in first)
     shown = f'```{{literalinclude}} {script.name}\n:language: python\n:%s: "{FIGURE}"'
     begin, rest = shown % "end-before", shown % "start-at"
-    assert page.index(begin) < page.index(f"(figures/{script.stem}.png)") < page.index(rest)
-    assert 10_000 <= (FOLDER / "figures" / f"{script.stem}.png").stat().st_size <= 80_000
+    assert page.index(begin) < page.index(f"(figures/{script.stem}.svg)") < page.index(rest)
+    assert 10_000 <= (FOLDER / "figures" / f"{script.stem}.svg").stat().st_size <= 80_000
 
 
 def printed_by(notebook) -> list[str]:
@@ -79,5 +79,5 @@ def test_the_notebook_prints_its_stored_output():
 
 def test_the_gallery_has_every_figure_with_a_caption():
     page = (FOLDER / "gallery.md").read_text(encoding="utf-8")
-    captions = re.findall(r"\(figures/(\w+)\.png\)\n\n\*Look at ", page)
+    captions = re.findall(r"\(figures/(\w+)\.svg\)\n\n\*Look at ", page)
     assert captions == [script.stem for script in SCRIPTS]
