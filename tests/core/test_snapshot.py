@@ -45,6 +45,7 @@ from worldstate.state import (
     RiskCue,
     SearchedView,
     SensorHealth,
+    SideShare,
     Tally,
     Visibility,
     WorldState,
@@ -556,3 +557,14 @@ def test_the_graph_holds_every_relation():
 def test_risk_is_the_largest_of_all_directions():
     assert full_state().risk == 0.7
     assert WorldState(0, 0).risk == 0.0
+
+
+def test_a_printed_advisory_has_the_azimuth_of_its_own_side():
+    sides = SideShare("left", 0.4, math.radians(52), 0.3), SideShare("right", 0.6, math.radians(-48), 0.3)
+    car = Entity("car", "hidden", 0.9, 0.87, math.radians(-48), 0.3, 0, 0, direction="right", sides=sides)
+    advised = RiskCue(
+        "left", math.radians(52), 0.3, 0.46, 0.9, 0.9, 3.0, None, Advisory(5_000_000_000, 6_500_000_000),
+        entity_id="car", usable=True, why_not=(),
+    )  # fmt: skip
+    printed = str(WorldState(5_500_000_000, 45, entities=(car,), cues=(advised,)))
+    assert "left: ADVISORY, risk 0.46, hidden vehicle at 52 degrees left" in printed

@@ -62,11 +62,15 @@ def state_lines(
 
 
 def _advised(cue: RiskCue, entity: Entity | None) -> str:
-    place = f"hidden {_kind(entity)} at {towards((entity or cue).azimuth_rad)}"
+    # A vehicle of unknown side has an azimuth for each side.
+    parts = () if entity is None else entity.on_each_side()
+    here = next((part for part in parts if part.direction == cue.direction), entity)
+    place = f"hidden {_kind(entity)} at {towards((here or cue).azimuth_rad)}"
     risk = "unknown" if cue.risk is None else f"{cue.risk:.2f}"
     times = cue.time_to_visible_s and "{1:.1f} s ({0:.1f} to {2:.1f})".format(*cue.time_to_visible_s)
-    parts = f"ADVISORY{_unless_usable([cue])}", f"risk {risk}", place, f"in view in {times}" if times else ""
-    return f"{plain(cue.direction)}: {', '.join(filter(None, parts))}"
+    when = f"in view in {times}" if times else ""
+    words = filter(None, (f"ADVISORY{_unless_usable([cue])}", f"risk {risk}", place, when))
+    return f"{plain(cue.direction)}: {', '.join(words)}"
 
 
 def _quiet(sides: Sequence[RiskCue]) -> str:
