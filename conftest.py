@@ -1,4 +1,4 @@
-"""Fixtures that cost seconds, made once a session."""
+"""Fixtures that take seconds, made once per session."""
 
 import json
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.demo import simulate_approach
 from worldstate.frontend.array.microphone_array import ovad_array
 
-# Two processes on two cores beside other work: how long an example takes says nothing of the code.
-# With the usual 100 examples of every law the suite was above its five minutes. Every clone draws the same
-# ones: of two hundred laws with new draws, one run in two met a rarest case, whoever's change it was.
+# Two processes share two cores with other work, so the duration of an example is not a property of the code.
+# With the usual 100 examples per law the suite took more than five minutes. Every clone draws the same
+# examples: with new draws, one run in two met a rare case of one of two hundred laws.
 settings.register_profile("shared_machine", deadline=None, max_examples=50, derandomize=True)
-# `make slow`, and whatever is called with --hypothesis-profile=anew.
+# For `make slow`, and for calls with --hypothesis-profile=anew.
 settings.register_profile("anew", deadline=None, max_examples=200)
 settings.load_profile("shared_machine")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Let the tests that share a fixture run in one process, or each of several makes it again."""
+    """Run the tests that share a fixture in one process; otherwise several processes make it."""
     for item in items:
         group = _shared(item)
         if group is not None and item.get_closest_marker("xdist_group") is None:
@@ -38,7 +38,7 @@ def pytest_collection_modifyitems(items):
 def _shared(item):
     scopes = {name: found[-1].scope for name, found in item._fixtureinfo.name2fixturedefs.items()}
     for name in ("approach", "smoke"):
-        # A parametrised argument may have that name too.
+        # A parametrised argument may have the same name.
         if scopes.get(name) == "session":
             return name
     return item.module.__name__ if {"module", "package"} & set(scopes.values()) else None
@@ -69,7 +69,8 @@ def approach(tmp_path_factory) -> Approach:
 
 @pytest.fixture(scope="session")
 def street(tmp_path_factory) -> Path:
-    """Return a folder with two seconds of noise, the places of its four microphones, and a camera's lens."""
+    """Return a folder with two seconds of noise, the positions of its four microphones, and a camera's
+    lens."""
     folder = tmp_path_factory.mktemp("street")
     noise = np.random.default_rng(4).normal(0.0, 0.1, (16_000, 4)).astype(np.float32)
     soundfile.write(folder / "street.wav", noise, 8_000, subtype="PCM_24")
@@ -81,9 +82,9 @@ def street(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory):
-    """The folder of a smoke evaluation, and its report."""
+    """Return the folder of a smoke evaluation, and its report."""
 
     out = tmp_path_factory.mktemp("evaluation")
-    # Five pools would import the library in two processes each: the second run in test_evaluate has pools.
+    # Five pools would import the library in two processes each: the second run in test_evaluate uses pools.
     assert study(["table", "--smoke", "--jobs", "1", "--out", str(out)]) == 0
     return out, json.loads((out / "evaluation.json").read_text())

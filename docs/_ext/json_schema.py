@@ -23,7 +23,8 @@ _ENTRY = re.compile(r"^(\w+(?:, \w+)*) : .*\n((?:    .*(?:\n|$))+)", re.MULTILIN
 def json_schema(cls: type) -> Schema:
     """Return the schema of a dataclass, every dataclass within it under ``$defs``.
 
-    Unknown keys are allowed, as readers ignore them, and what an earlier minor version lacks may be missing.
+    Unknown keys are allowed, because readers ignore them, and keys that an earlier minor version lacks are
+    optional.
 
     Examples
     --------
@@ -62,7 +63,7 @@ def _of(hint: Hint, defs: dict[str, Schema]) -> Schema:
 
 def _reference(cls: Any, defs: dict[str, Schema]) -> Schema:
     if cls.__name__ not in defs:
-        defs[cls.__name__] = {}  # A class within itself refers to this
+        defs[cls.__name__] = {}  # A class within itself refers to this entry
         defs[cls.__name__] = _record(cls, defs)
     return {"$ref": f"#/$defs/{cls.__name__}"}
 
@@ -85,12 +86,12 @@ def _record(cls: Any, defs: dict[str, Schema]) -> Schema:
 
 
 def _descriptions(cls: Any) -> dict[str, str]:
-    """Return what the docstring of a class says of its fields."""
+    """Return the descriptions of a class's fields from its docstring."""
     entries = _ENTRY.findall(inspect.getdoc(cls) or "")
     return {name: " ".join(text.split()) for names, text in entries for name in names.split(", ")}
 
 
-# What ships in `worldstate/data`, by the name of its type in logs.
+# Schemas that ship in `worldstate/data`, by the name of the type in logs.
 SHIPPED: dict[str, type] = {
     "snapshot": WorldState,
     "foxglove.SceneUpdate": SceneUpdate,

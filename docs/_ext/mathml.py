@@ -8,13 +8,13 @@ from sphinx.application import Sphinx
 from sphinx.errors import SphinxError
 from sphinx.writers.html5 import HTML5Translator
 
-# MathML grows a fence with what it encloses, which is what `\big[ ... \Big\rangle` asks of TeX by hand.
+# MathML scales a fence with its content, which TeX does by hand in `\big[ ... \Big\rangle`.
 SIZED = re.compile(r"\\[bB]ig\s*(\\[a-z]+|\\[{}]|[\[\]()])")
 OPENING = ("[", "(", r"\{", r"\langle", r"\lceil", r"\lfloor")
 
 
 def mathml(latex: str, display: str) -> str:
-    """Return the MathML element of an equation; an unknown command is an error, not text on the page."""
+    """Return the MathML element of an equation; an unknown command raises an error."""
     fenced = SIZED.sub(lambda m: (r"\left" if m[1] in OPENING else r"\right") + m[1], latex)
     made = convert(fenced.replace(r"\arg", r"\operatorname{arg}"), display=display)
     if "\\" in made:
@@ -29,7 +29,7 @@ def visit_inline(translator: HTML5Translator, node: Element) -> None:
 
 
 def visit_block(translator: HTML5Translator, node: Element) -> None:
-    """Write an equation on a line of its own, with its number where it has one."""
+    """Write a displayed equation with its number, if it has one."""
     number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
     translator.body.append(f'<div class="math">{mathml(node.astext(), "block")}{number}</div>\n')
     raise SkipNode

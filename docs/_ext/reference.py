@@ -1,6 +1,7 @@
-"""The reference: of the packages a page each, of what they export; of the command a page of every help.
+"""The reference: one page for the exports of each package, and one page for the help of all commands.
 
-A name that several packages export has its entry where it is most at home, and a link elsewhere.
+A name that several packages export has its entry in the deepest one above its definition, and links
+elsewhere.
 """
 
 import argparse
@@ -82,7 +83,7 @@ def summary(value: object) -> str:
             return "Type: " + " or ".join(f":py:obj:`{one.__name__}`" for one in value.__args__)
         several = isinstance(value, Iterable) and not isinstance(value, str)
         told = ", ".join(map(str, value)) if several else str(value)
-        # A type alias holds asterisks.
+        # A type alias contains asterisks.
         return "Constant: " + told.replace("*", r"\*") + "."
     return " ".join((inspect.getdoc(value) or "").split("\n\n")[0].split())
 
@@ -128,7 +129,7 @@ def command_line() -> str:
 
 
 def write(app: "Sphinx") -> None:
-    """Write the pages below reference/api/, touching none that has not changed."""
+    """Write the changed pages below reference/api/."""
     folder = Path(app.srcdir) / "reference" / "api"
     folder.mkdir(parents=True, exist_ok=True)
     exported = exports()
@@ -153,7 +154,7 @@ def write(app: "Sphinx") -> None:
 
 
 def resolve(app: "Sphinx", env: "BuildEnvironment", node: "pending_xref", text: "Element") -> "Node | None":
-    """Link a name by its last part, or by `Class.member`, to the entry of what is exported."""
+    """Link a name, or `Class.member`, to the entry of the exported object."""
     if node.get("refdomain") != "py":
         return None
     parts = node["reftarget"].strip("~.").split(".")
