@@ -1,15 +1,17 @@
-"""The whole chain over blocks of sound: one world-state a hop out."""
+"""The whole chain: blocks of sound in, one world-state per hop out."""
 
 import heapq
 import logging
 from bisect import insort
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy, deepcopy
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, wraps
+from inspect import signature
+from itertools import chain
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, ParamSpec, TypeVar, Unpack
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteSignature
-from worldstate.adapters.audio.sound_file import Audio, RawPcm, SoundInput, open_sound
+from worldstate.adapters.audio.sound_file import Audio, RawPcm, open_sound
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.camera.vision_query import SENSOR, SeveralCameras, VisionQuery
 from worldstate.adapters.files.acoustic_domain import outside_of
@@ -38,30 +40,32 @@ from worldstate.state import WorldState
 
 from .acoustic import AcousticAdapter
 from .own_parts import OtherModality, checked_frame, checked_timed
-from .source import ListenerParts, Source, SourceParts, check_clocks, check_mounting, open_source
+from .source import Source, SourceParts, check_clocks, check_mounting, open_source
 
+P = ParamSpec("P")
+T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
-# Stands for the file where sound is pushed.
+# Name of the recording if sound is pushed.
 PUSHED = "pushed sound"
-# Half a hop.
+# A part is half a hop.
 PARTS_PER_SECOND = 20
-# What waits for its sound at most: ten minutes of odometry at 100 Hz, and boxes of the largest file.
+# Limits of what waits for its sound: ten minutes of odometry at 100 Hz, and the boxes of the largest file.
 MOST_AHEAD, MOST_AHEAD_BYTES = 1 << 16, 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One hop: what was heard, what was measured, what is believed.
+    """One hop: front-end output, measurement and belief.
 
     Parameters
     ----------
     frame : AcousticFrame
-        What the front-end read from the sound.
+        Output of the front-end.
     measurement : Measurement
-        What the adapter made of it.
+        Measurement that the adapter made from it.
     checkpoint : Checkpoint
-        What another run goes on from: the belief after it, whose snapshot is `state`, and what was learned of
-        the site and heard of the street up to it.
+        State from which another run continues: the belief, whose snapshot is `state`, and what was learned
+        about the site and the street.
 
     Examples
     --------
@@ -90,16 +94,16 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Senses:
-    """What ears and eyes remember between two samples.
+    """Memory of the front-end and of the cameras between two samples.
 
     Parameters
     ----------
     now_ns : int
         Time of the next sample.
     ears : FrontEnd
-        The sound of the last window, and what the channels' health is judged by.
+        Sound of the last window, and statistics of the channels.
     eyes : mapping of str to VisionQuery
-        The last images of each camera, by its name.
+        Last images of each camera, by its name.
     """
 
     now_ns: int
@@ -108,26 +112,26 @@ class Senses:
 
 
 class Listener:
-    """Blocks of sound in, one world-state a hop (0.1 s) out; the same to the bit for blocks of any length.
+    """Blocks of sound in, one world-state per hop (0.1 s) out; the length of the blocks has no effect.
 
     Parameters
     ----------
-    array : MicrophoneArray, path or Source
-        What hears: positions, or a file of them as `read_array` takes it. A `Source` from `open_source` has
-        all of the parts below; its sound is not opened.
+    array : MicrophoneArray, path, name or Source
+        Positions of the microphones, as `open_source` takes them. A `Source` contains all of the parts below;
+        its sound is not opened.
     sample_rate_hz : float
-        Of the blocks.
+        Sample rate of the blocks.
     start_s : float, optional
-        Time of the first sample on the clock of the states; 0 where not given, or with a checkpoint of
-        another listener its last sample.
+        Time of the first sample on the clock of the states. Default: 0, or the end of the checkpoint of
+        another listener.
     spectra : GivenSpectra, optional
         Spatial spectra that another front-end computed for the array of the model; blocks then hold one
-        channel. The snapshots state no budget, and how well could be heard is null.
+        channel. The snapshots state no budget and no audibility.
     **parts
-        As `open_source` takes them: `model`, `camera`, `miss_rates`, `context`, `sides`, `moving_ego`,
-        `budget` or `alpha`, `settings`, and `resume`, a `Checkpoint` or a file of one. The checkpoint of a
-        listener goes on at the next sample. One of a file holds no sound: begin a second or more before it
-        with `start_s`; what is heard up to its time fills the windows.
+        As `open_source` takes them: `car`, `model`, `camera`, `miss_rates`, `context`, `sides`, `moving_ego`,
+        `budget` or `alpha`, `uncalibrated`, `settings`, and `resume`. With the `Checkpoint` of a listener the
+        next sample continues it. A file holds no sound: begin a second or more before its time with
+        `start_s`; this sound fills the windows.
 
     Attributes
     ----------
@@ -137,7 +141,7 @@ class Listener:
     Raises
     ------
     InvalidArgumentError, OutOfDomainError
-        As `open_source`; or if the checkpoint is that of a listener with another array, rate or search.
+        As `open_source`; or if the checkpoint is of a listener with another array, rate or search.
 
     Examples
     --------
@@ -156,7 +160,7 @@ class Listener:
         *,
         start_s: float | None = None,
         spectra: GivenSpectra | None = None,
-        **parts: Unpack[ListenerParts],
+        **parts: Unpack[SourceParts],
     ) -> None:
         self._blind = not isinstance(array, Source) and parts.get("camera") is None
         if not isinstance(array, Source):
@@ -167,7 +171,7 @@ class Listener:
         else:
             source = array
         if spectra is not None:
-            # Nobody has set a threshold with this front-end: no budget is stated.
+            # No threshold was calibrated with this front-end, so that no budget is stated.
             source = replaced(source, policy=replaced(source.policy, alpha=0.0))
         self.world = source.world()
         self._source, self._rate_hz = source, sample_rate_hz
@@ -190,12 +194,12 @@ class Listener:
         )
         if spectra is not None:
             self._adapter.take_spectra(spectra, source.start_ns)
-        # What the belief to go on from has taken in already, or what was told before it began, is left out.
+        # Measurements before the beginning, or already in the resumed belief, are left out.
         self._since_ns = source.start_ns - 1 if source.before is None else self.world.stamp_ns
         self._waiting = _Waiting(source.others, self._since_ns)
         self._part = max(int(sample_rate_hz / PARTS_PER_SECOND), 1)
         self._first_ns, self._samples, self._warned = source.start_ns, 0, set[str]()
-        self._ahead: list[tuple[int, str, Callable[[], int], int]] = []  # In the order of their stamps
+        self._ahead: list[tuple[int, str, Callable[[], int], int]] = []  # In the order of their time stamps
         self._ahead_bytes = 0
         domain: ModelDomain | None = getattr(source.model, "domain", None)
         self._domain, ego = None if source.settings.uncalibrated else domain, self.world.state.ego
@@ -205,7 +209,7 @@ class Listener:
             self._go_on(senses)
 
     def _go_on(self, senses: Senses) -> None:
-        """Hear and see on with the windows of another listener."""
+        """Continue with the windows of another listener."""
         hear, before = self._adapter.front_end, senses.ears
         one, other = ((of.sample_rate_hz, of.settings) for of in (hear, before))
         if one != other or not np.array_equal(hear.array.positions_m, before.array.positions_m):
@@ -222,8 +226,8 @@ class Listener:
         Parameters
         ----------
         block : ndarray
-            Shape (n, M), any n; floats of full scale 1, int16 or int32. None at the end of the sound, where
-            a resampled hop still waits for the next samples.
+            Shape (n, M), any n; floats of full scale 1, int16 or int32. None ends the sound and completes a
+            resampled hop.
 
         Returns
         -------
@@ -233,28 +237,28 @@ class Listener:
         Raises
         ------
         InvalidArgumentError
-            On another number of channels, NaN or infinity.
+            For another number of channels, NaN or infinity.
         """
         return [step.state for step in self.steps(block)]
 
     def add(self, *told: Timed) -> None:
-        """Take odometry, positions or measurements of other sensors; each counts from its own stamp on.
+        """Add odometry, positions or measurements of other sensors; each takes effect at its own time stamp.
 
-        What is stamped more than two seconds before the sound, or after what is pushed next, is refused and
-        counted; so is what comes while 65,536 wait for their sound.
+        A measurement more than two seconds before the sound or after the next block is refused and counted.
+        So is a measurement that arrives while 65,536 wait for their sound.
         """
         for one in told:
             self._take(checked_timed("add", one).stamp_ns, one.source, partial(self._waiting.add, one))
 
     def skip(self, lost_ns: int) -> None:
-        """Let time go on by sound that was lost and is not pushed as silence.
+        """Advance the time by lost sound that is not pushed as silence.
 
-        Push .9 s of silence before, so that the snapshot says that samples were lost.
+        Push 0.9 s of silence before, so that the snapshot reports lost samples.
 
         Parameters
         ----------
         lost_ns : int
-            Length of the sound, nanoseconds.
+            Length of the lost sound, nanoseconds.
 
         Raises
         ------
@@ -277,40 +281,41 @@ class Listener:
             self._reader.miss(round(seconds(lost_ns) * HOP_RATE_HZ))
 
     def refuse(self, inputs: int, name: str = "", problem: str = "") -> None:
-        """Count so many inputs that were refused before they reached the belief; warn of the first of a name.
+        """Count refused inputs; warn about the first one of a name.
 
         Raises
         ------
         InvalidArgumentError
-            If it is no number, or negative.
+            If the count is not a number, or negative.
         """
         self.world = self.world.refused(int(in_range("inputs", inputs, 0, 2**53)))
         if problem and name not in self._warned:
-            _LOG.warning("%s: what %s", name, problem)
+            _LOG.warning("%s: %s", name, problem)
             self._warned.add(name)
 
     def look(self, stamp_ns: int, frame: DetectionFrame | Any, camera: str = SENSOR) -> None:
-        """Take what a running detector found in an image; of several cameras the one is named.
+        """Add the detections of a running detector in one image.
 
-        One that was taken more than two seconds before the sound, or after what is pushed next, is refused,
-        and so are boxes outside the image, and what comes while 65,536 looks or 64 MiB of them wait for their
-        sound; `WorldState.delivery` counts them.
+        An image more than two seconds before the sound or after the next block is refused. So are boxes
+        outside the image, and images that arrive while 65,536 images or 64 MiB wait for their sound.
+        `WorldState.delivery` counts them.
 
         Parameters
         ----------
         stamp_ns : int
-            When the image was taken by the stamps of the camera, nanoseconds.
+            Time of the image on the clock of the camera, nanoseconds.
         frame : DetectionFrame, or Detections of supervision, or Results of ultralytics
-            All of its boxes.
+            All boxes of the image.
         camera : str
-            Name of the camera, where the source has several.
+            Name of the camera, if the source has several.
 
         Raises
         ------
         InvalidArgumentError
-            If there is no such camera, or none was given, where the array is not OVAD's; or if it is none.
+            If there is no such camera, if no camera was given for an array other than OVAD's, or if `frame`
+            is not a DetectionFrame.
         InputFileError
-            If all boxes lie outside the image; a look that waits for its sound is refused then, and counted.
+            If all boxes are outside the image. An image that waits for its sound is refused later.
         """
         if self._blind:
             check_mounting(self._source.array)
@@ -322,7 +327,7 @@ class Listener:
         self._take(taken_ns, camera, partial(_seen, query, stamp_ns, frame), held_bytes)
 
     def _take(self, stamp_ns: int, name: str, take: Callable[[], int], held_bytes: int = 0) -> None:
-        """Take what is near the sound; what is ahead of it waits for its own."""
+        """Pass on a measurement near the sound; keep one that is ahead of it."""
         if stamp_ns <= self._now_ns() + LAG_NS:
             if self._is_near(stamp_ns, name):
                 self.refuse(take())
@@ -330,10 +335,10 @@ class Listener:
             self._ahead_bytes += held_bytes
             insort(self._ahead, (stamp_ns, name, take, held_bytes), key=itemgetter(0))
         else:
-            self.refuse(1, name, f"comes while {len(self._ahead)} wait for their sound is refused")
+            self.refuse(1, name, f"a measurement is refused, because {len(self._ahead)} wait for their sound")
 
     def _take_due(self) -> None:
-        """Take what has waited for the sound that was pushed."""
+        """Pass on the measurements whose sound has been pushed."""
         while self._ahead and self._ahead[0][0] <= self._now_ns():
             stamp_ns, name, take, held_bytes = self._ahead.pop(0)
             self._ahead_bytes -= held_bytes
@@ -341,25 +346,25 @@ class Listener:
                 if self._is_near(stamp_ns, name):
                     self.refuse(take())
             except WorldstateError as error:
-                self.refuse(1, name, f"cannot be read is refused: {error}")
+                self.refuse(1, name, f"a measurement is refused: {error}")
 
     def _now_ns(self) -> int:
-        """Return the time of the sound up to which it was pushed."""
+        """Return the time up to which sound was pushed."""
         return self._first_ns + nanoseconds(self._samples / self._rate_hz)
 
     def _is_near(self, stamp_ns: int, name: str) -> bool:
-        """Return whether a stamp is near the sound that was pushed; else count it."""
+        """Return whether a time stamp is near the pushed sound; otherwise count it as refused."""
         far_ns = stamp_ns - self._now_ns()
         if near := abs(far_ns) <= LAG_NS:
             return near
-        told = f"is stamped {seconds(far_ns):.1f} s from the sound is refused, and all that is more than"
-        self.refuse(1, name, f"{told} {seconds(LAG_NS):.0f} s")
+        got = f"refused, because its time stamp is {seconds(far_ns):.1f} s from the sound"
+        self.refuse(1, name, f"a measurement is {got}; at most {seconds(LAG_NS):.0f} s are allowed")
         return near
 
     def checkpoint(self) -> Checkpoint:
-        """Return what another listener goes on from at the next sample, to the bit.
+        """Return the state from which another listener continues at the next sample, bit for bit.
 
-        What was told and waits for its time, at most 0.1 s of it, is told again to the other.
+        Measurements that wait for their time, at most 0.1 s of them, must be added to the other one again.
 
         Examples
         --------
@@ -372,13 +377,13 @@ class Listener:
         >>> other.push(noise[50_000:]) == listener.push(noise[50_000:])
         True
         """
-        # Ears are changed by what they hear, a camera's memory is replaced.
+        # The front-end changes in place, while the memory of a camera is replaced.
         eyes = {name: copy(query) for name, query in self._cameras.items()}
         senses = Senses(self._now_ns(), deepcopy(self._adapter.front_end), eyes)
         return replaced(self._learned(), senses=senses)
 
     def _learned(self) -> Checkpoint:
-        """Return the belief and what was learned of site and street."""
+        """Return the belief and the learned site and street."""
         signature, reader = self._signature, self._reader
         site = signature.estimate if isinstance(signature, SiteSignature) else None
         if not isinstance(reader, SequenceReader):
@@ -387,14 +392,14 @@ class Listener:
         return Checkpoint(self.world, site, reader.history, hearing)
 
     def steps(self, block: Float32Array | None) -> Iterator[Step]:
-        """Yield the hops that end in the next samples, or wait at the end, as heard and measured."""
+        """Yield the hops that end in the next samples; with None the last hop."""
         reader = self._reader if self._source.settings.site_adaptation else None
         for frame in self._frames(block):
             for other in self._waiting.until(frame.stamp_ns):
                 self.world = self.world.update(other)
                 self._speed_mps = other.speed_mps if isinstance(other, Odometry) else self._speed_mps
             measurement = self._adapter.interpret(frame, self._outside())
-            # After a long loss the belief is carried there first: what is far ahead of it is held back.
+            # After a long loss the belief is predicted first: it refuses measurements far ahead of it.
             if measurement.stamp_ns - self.world.stamp_ns > LAG_NS:
                 self.world = self.world.predict_to(measurement.stamp_ns)
             self.world = self.world.update(measurement)
@@ -403,91 +408,134 @@ class Listener:
             yield Step(frame, measurement, self._learned())
 
     def measured(self, block: Float32Array | None) -> Iterator[tuple[AcousticFrame, Measurement]]:
-        """Yield the hops that end in the next samples as they were heard and measured, nothing filtered."""
+        """Yield front-end output and measurement of the next hops, without a filter."""
         return ((frame, self._adapter.interpret(frame)) for frame in self._frames(block))
 
     def _outside(self) -> str | None:
-        """Return why the model reads nothing at the speed of the ego; warn of the first such hop."""
+        """Return the reason why the model does not apply at the speed of the ego; warn once."""
         reason = outside_of(self._domain, self._speed_mps)
         if reason is not None:
-            self.refuse(0, reason, f"is heard at {self._speed_mps:.1f} m/s begins no advisory")
+            self.refuse(0, reason, f"sound at {self._speed_mps:.1f} m/s begins no advisory")
         return reason
 
     def _frames(self, block: Float32Array | None) -> Iterator[AcousticFrame]:
-        """Yield the hops that end in the next samples, or wait at the end."""
+        """Yield the front-end output of the hops that end in the next samples, or of the last hop."""
         hear = self._adapter.front_end
         for part in [None] if block is None else self._parts(block):
             frames = hear.finish() if part is None else hear.process(part)
             self._samples += 0 if part is None else len(part)
             self._take_due()
             for frame in frames:
-                # What the belief to go on from has taken in already only fills the windows.
+                # Hops that are already in the resumed belief only fill the windows.
                 if frame.stamp_ns > self._since_ns:
                     yield frame
         while self._ahead and not self._is_near(*self._ahead[-1][:2]):
             self._ahead_bytes -= self._ahead.pop()[-1]
 
     def _parts(self, block: Float32Array) -> Iterator[Float32Array]:
-        """Cut a block so that no two hops end in one part."""
-        # What waits for its sound is taken before the hops after it.
+        """Split a block so that at most one hop ends in each part."""
+        # Waiting measurements are passed on before the hops after them.
         return (block[start : start + self._part] for start in range(0, len(block), self._part))
 
 
-def listen(path: SoundInput | str | Sequence[str], **parts: Unpack[SourceParts]) -> Iterator[WorldState]:
-    """Yield one world-state a hop (0.1 s) from a sound file or recording folder.
+def _of_recording(opened: Callable[P, Source]) -> Callable[[Callable[[Source], T]], Callable[P, T]]:
+    """Turn a function of a source into one with the arguments of `open_source`, which `help` then shows."""
+
+    def decorate(function: Callable[[Source], T]) -> Callable[P, T]:
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+            return function(opened(*args, **kwargs))
+
+        returned = signature(function).return_annotation
+        call.__signature__ = signature(opened).replace(return_annotation=returned)  # type: ignore[attr-defined]
+        return call
+
+    return decorate
+
+
+@_of_recording(open_source)
+def listen(source: Source) -> Iterator[WorldState]:
+    """Yield the world-states of a recording or a stream, one per hop (0.1 s), as the sound is read.
+
+    The first state comes after the first second of sound. `run` returns the same states as a list.
 
     Parameters
     ----------
-    path : path, sequence of paths, SoundStream or Audio
-        Multichannel sound file, a recording folder in the OVAD layout, a file a microphone in their order,
-        a stream (raw samples from a pipe, the sound of a bag), or an open recording.
-    array, detections, detector, camera, miss_rates, model, context, budget, alpha, settings
-        As `open_source` takes them: files, or the objects that they hold.
+    path, array, ...
+        As `open_source` takes them.
 
-    Yields
+    Raises
     ------
-    WorldState
-        The first after the first second of sound.
+    InputFileError, InvalidArgumentError, OutOfDomainError
+        As `open_source`, at the call; for a file also if its first second of sound is unusable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import soundfile
+    >>> from tempfile import TemporaryDirectory
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (19_200, 7))
+    >>> with TemporaryDirectory() as folder:
+    ...     soundfile.write(f"{folder}/noise.wav", noise, 16_000)
+    ...     [state.stamp_ns / 1e9 for state in listen(f"{folder}/noise.wav", "uma-8")]
+    [1.0, 1.1, 1.2]
+    """
+    steps = listen_steps(source)
+    # A generator raises no error before its first item. A stream would block the call.
+    first = [] if isinstance(source.sound, RawPcm | Audio) else [step for step in [next(steps, None)] if step]
+    return (step.state for step in chain(first, steps))
+
+
+@_of_recording(open_source)
+def run(source: Source) -> list[WorldState]:
+    """Return the world-states of a recording, one per hop (0.1 s), as the command of this name writes them.
+
+    Parameters
+    ----------
+    path, array, ...
+        As `open_source` takes them. Each option of the command has the same name.
+
+    Returns
+    -------
+    list of WorldState
+        The first state is that of the first second. `listen` yields them one by one for a long recording.
 
     Raises
     ------
     InputFileError
-        If a file is missing or damaged; the message names it.
-    InvalidArgumentError
+        If a file is missing, damaged or does not fit the array.
+    InvalidArgumentError, OutOfDomainError
         As `open_source`.
 
     Examples
     --------
-    A second and a fifth of noise:
-
     >>> import numpy as np
     >>> import soundfile
-    >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
+    >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (19_200, 7))
     >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "noise.wav"
-    ...     soundfile.write(path, noise, 48_000)
-    ...     [(state.stamp_ns / 1e9, len(state.entities)) for state in listen(path)]
-    [(1.0, 0), (1.1, 0), (1.2, 0)]
+    ...     soundfile.write(f"{folder}/noise.wav", noise, 16_000)
+    ...     states = run(f"{folder}/noise.wav", array="uma-8")
+    >>> len(states), [cue.direction for cue in states[-1].cues]
+    (3, ['left', 'right'])
     """
-    yield from (step.state for step in listen_steps(open_source(path, **parts)))
+    return [step.state for step in listen_steps(source)]
 
 
 def listen_steps(source: Source, kept: BoolArray | None = None) -> Iterator[Step]:
-    """Yield every hop of `source` with what was heard and measured.
+    """Yield every hop of a source with its front-end output, measurement and belief.
 
     Parameters
     ----------
     source : Source
         From `open_source`.
     kept : ndarray of bool, optional
-        Which seconds are heard, shape (n,); the others are skipped as `Listener.skip` does. All if not given.
+        Seconds that are processed, shape (n,); the others are skipped as by `Listener.skip`. Default: all.
 
     Yields
     ------
     Step
-        One a hop, the first after the first second of sound.
+        One per hop, the first after the first second of sound.
 
     Raises
     ------
@@ -512,24 +560,24 @@ def listen_steps(source: Source, kept: BoolArray | None = None) -> Iterator[Step
 
 
 def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]:
-    """Yield every hop of `source` as it was heard and measured, nothing filtered: what calibration needs.
+    """Yield front-end output and measurement of every hop, without a filter, for calibration.
 
     Parameters
     ----------
     source : Source
-        What to listen to.
+        From `open_source`.
 
     Yields
     ------
     frame, measurement : AcousticFrame, Measurement
-        One pair a hop.
+        One pair per hop.
 
     Raises
     ------
     InputFileError
         If the sound file is damaged or does not fit the array.
     OutOfDomainError
-        If no model reads the sound.
+        If there is no model for the array.
 
     Examples
     --------
@@ -549,9 +597,12 @@ def measure_steps(source: Source) -> Iterator[tuple[AcousticFrame, Measurement]]
 
 
 def listened(source: Source, kept: BoolArray | None = None) -> Iterator[tuple[Listener, Float32Array | None]]:
-    """Yield the sound of `source` block by block, None last, each beside the one listener to take it."""
-    strict, n_microphones = not source.settings.mask_dead, source.array.n_microphones
-    with open_sound(source.sound, n_microphones, channels=source.array.channels, strict=strict) as audio:
+    """Yield the sound of a source in blocks, None last, each with the listener that processes it."""
+    n_microphones, channels = source.array.n_microphones, source.array.channels
+    with open_sound(source.sound, n_microphones, channels=channels, strict=False) as audio:
+        if audio.silent_channels:
+            silent = ", ".join(map(str, audio.silent_channels))
+            _LOG.warning("%s: channel %s is silent and left out", audio.path, silent)
         endless = isinstance(source.sound, RawPcm | Audio)
         check_clocks(source, None if endless else audio.duration_s)
         listener = Listener(source, audio.sample_rate_hz)
@@ -565,7 +616,7 @@ def listened(source: Source, kept: BoolArray | None = None) -> Iterator[tuple[Li
 
 
 def learn_passes(street: StreetListener | None, state: WorldState) -> None:
-    """Tell a street out of which of its arms a vehicle has just come into view."""
+    """Add the arms out of which a vehicle has just come into view to a learned street."""
     if street is None:
         return
     arms = {one.id: one.direction for one in state.entities}
@@ -576,14 +627,14 @@ def learn_passes(street: StreetListener | None, state: WorldState) -> None:
 
 
 def _seen(query: VisionQuery, stamp_ns: int, frame: DetectionFrame) -> int:
-    """Take a look; return how many of its boxes are refused."""
+    """Add the detections of an image; return the number of refused boxes."""
     before = query.outside
     query.see(stamp_ns, frame)
     return query.outside - before
 
 
 class _Waiting:
-    """Measurements of other sensors that wait for their time, oldest first."""
+    """Queue of measurements of other sensors, oldest first."""
 
     def __init__(self, others: Iterable[OtherModality], after_ns: int) -> None:
         merged = heapq.merge(*(one() for one in others), key=attrgetter("stamp_ns"))
@@ -593,14 +644,14 @@ class _Waiting:
         self._told: list[Timed] = []
 
     def add(self, told: Timed) -> int:
-        """Take what has just been measured; return 1 if it is refused, as so many wait."""
+        """Add a measurement; return 1 if the queue is full and it is refused."""
         if told.stamp_ns <= self._after_ns or len(self._told) >= MOST_AHEAD:
             return int(told.stamp_ns > self._after_ns)
         insort(self._told, told, key=attrgetter("stamp_ns"))
         return 0
 
     def until(self, stamp_ns: int) -> Iterator[Timed]:
-        """Yield what was measured up to a time and has not been yielded before."""
+        """Remove and yield the measurements up to a time."""
         while self._next is not None and self._next.stamp_ns <= stamp_ns:
             yield self._next
             self._next = next(self._recorded, None)

@@ -1,46 +1,46 @@
-"""Parts that installed packages bring, each by its entry point: detectors, exporters, other modalities.
+"""Parts of installed packages, found by their entry points: detectors, exporters, other sensors.
 
-A package names them in its pyproject.toml, and the command line names one of them:
+A package lists its parts in its pyproject.toml:
 
-| group of entry points | what stands there | option |
+| group of entry points | type of the part | use |
 |---|---|---|
 | `worldstate.detectors` | `DetectorPart` | ``--detector NAME`` |
 | `worldstate.exporters` | `ExporterPart` | ``--export NAME=TARGET`` |
-| `worldstate.measurements` | `MeasurementsPart` | ``--measurements NAME=FILE`` |
+| `worldstate.measurements` | `MeasurementsPart` | ``"measurements": {NAME: FILE}`` of a car file |
 """
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from worldstate.adapters.camera.detections import DetectionFrame, Detector
+from worldstate.adapters.camera.detectors import MotionDetector, OnnxDetector, open_onnx
 from worldstate.core.fixed_lag import Timed
 from worldstate.ground.errors import InvalidArgumentError, OwnPartError, WorldstateError
 from worldstate.ground.typing import ImageArray
 from worldstate.state import WorldState
 
-# Exit codes above it are those of signals.
+# Larger exit codes are those of signals.
 SIGNALLED = 128
+# Detectors by background subtraction, whose score is not a confidence.
+MOTION = "motion", "knn"
 Group = Literal["worldstate.detectors", "worldstate.exporters", "worldstate.measurements"]
-# What other modalities say, each time it is asked for anew.
+# Returns the measurements of another sensor, at each call from the beginning.
 OtherModality: TypeAlias = Callable[[], Iterable[Timed]]
-
-
-# Makes a detector that has seen no image, a new one for every video; a class without arguments does.
+# Makes a new detector for each video, for example a class without arguments.
 DetectorPart: TypeAlias = Callable[[], Detector]
-# Opens what states go to, a file, a socket, another stack: lends a function of one state, called once a hop.
+# Opens a target, such as a file or a socket, and returns a function that is called with each state.
 ExporterPart: TypeAlias = Callable[[str], AbstractContextManager[Callable[[WorldState], object]]]
-# Reads what another sensor recorded as measurements on the clock of the sound, in the order of their stamps;
-# what wraps a `MeasurementAdapter` does.
+# Reads a file of another sensor: measurements on the clock of the sound, in the order of their time stamps.
 MeasurementsPart: TypeAlias = Callable[[Path], Iterable[Timed]]
 
 
 def installed(group: Group) -> list[str]:
-    """Return the names that installed packages bring.
+    """Return the names of the installed parts of a group.
 
     Examples
     --------
@@ -51,28 +51,28 @@ def installed(group: Group) -> list[str]:
 
 
 def load_part(group: Group, name: str, option: str, built_in: Iterable[str] = ()) -> Any:
-    """Import what a package brings under a name; nothing of it was imported before.
+    """Import a part of an installed package by its name.
 
     Parameters
     ----------
     group : str
         Group of entry points.
     name : str
-        As the package calls it.
+        Name of the entry point.
     option : str
-        That named it, for messages.
+        Argument that holds the name, for error messages.
     built_in : iterable of str
-        Other names that the option takes, for messages.
+        Further names that the argument takes, for error messages.
 
     Raises
     ------
     InvalidArgumentError
-        If no package brings it, two do, or its module cannot be imported.
+        If no package or more than one has such a part, or if its module cannot be imported.
     """
     found = list(entry_points(group=group, name=name))
     if len({one.value for one in found}) != 1:
         known = ", ".join([*built_in, *installed(group)]) or "none is installed"
-        several = f", which {len(found)} packages bring" if found else ""
+        several = f", a name in {len(found)} packages" if found else ""
         raise InvalidArgumentError(f"{option}: expected one of {group} ({known}), got {name!r:.60}{several}")
     try:
         with of_part(found[0].value):
@@ -87,13 +87,13 @@ def load_part(group: Group, name: str, option: str, built_in: Iterable[str] = ()
 
 @contextmanager
 def of_part(name: str) -> Iterator[None]:
-    """Turn whatever a part raises inside into an error with its name, `SystemExit` too."""
+    """Turn every exception of a part, `SystemExit` included, into an error with the part's name."""
     try:
         yield
     except (WorldstateError, KeyboardInterrupt, GeneratorExit):
         raise
     except BaseException as error:
-        # A signal that ends the program: see `run_program`.
+        # `run_program` turns signals that end the program into such exits.
         if isinstance(error, SystemExit) and isinstance(error.code, int) and error.code > SIGNALLED:
             raise
         raise OwnPartError(name, error) from error
@@ -101,19 +101,19 @@ def of_part(name: str) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class OwnDetector:
-    """A detector that a package brings, whose errors have its name."""
+    """A detector of an installed package; errors carry its name."""
 
     name: str
     detector: Detector
 
     @classmethod
     def of(cls, name: str, part: DetectorPart) -> "OwnDetector":
-        """Make one that has seen no image."""
+        """Return a new detector."""
         with of_part(name):
             return cls(name, part())
 
     def detect(self, frame: ImageArray) -> DetectionFrame:
-        """Return what it finds in an image."""
+        """Return the detections in an image."""
         with of_part(self.name):
             found = self.detector.detect(frame)
         return checked_frame(self.name, found)
@@ -129,7 +129,7 @@ def checked_frame(name: str, found: object) -> DetectionFrame:
 
 
 def checked_timed(name: str, told: object) -> Timed:
-    """Return what another sensor measured; refuse None and whatever else is no measurement."""
+    """Return the measurement of another sensor; refuse anything else."""
     if not isinstance(told, Timed):
         expected = "Measurement, PositionScan or Odometry"
         raise InvalidArgumentError(f"{name}: expected {expected}, got {told!r:.60}")
@@ -138,7 +138,7 @@ def checked_timed(name: str, told: object) -> Timed:
 
 @contextmanager
 def own_exporter(name: str, part: ExporterPart, target: str) -> Iterator[Callable[[WorldState], object]]:
-    """Open what an exporter of a package lends, whose errors have its name."""
+    """Open an exporter of an installed package; errors carry its name."""
     with ExitStack() as opened:
         with of_part(name):
             export = opened.enter_context(part(target))
@@ -164,10 +164,38 @@ def part_and_target(option: str, text: str) -> tuple[str, str]:
     return name, target
 
 
-def other_modality(option: str, text: str) -> OtherModality:
-    """Return what NAME=FILE reads, by the package that brings NAME."""
-    name, path = part_and_target(option, text)
-    return partial(_checked, load_part("worldstate.measurements", name, option), Path(path), name=name)
+def other_modality(name: str, path: Path) -> OtherModality:
+    """Return the reader of another sensor's file, by the package that has a reader of that name."""
+    return partial(_checked, load_part("worldstate.measurements", name, "measurements"), path, name=name)
+
+
+def detector_maker(name: str, labels: tuple[str, ...] = ("car",)) -> DetectorPart:
+    """Return a function that makes a detector; an ONNX model, with the labels of its classes, is opened once.
+
+    Raises
+    ------
+    InvalidArgumentError
+        If there is no detector of that name.
+    """
+    if name.endswith(".onnx"):
+        make = partial(_opened, Path(name), labels)
+        make()  # An unusable model is refused before the work begins
+        return make
+    if name not in MOTION:
+        known = (*MOTION, "FILE.onnx")
+        return partial(OwnDetector.of, name, load_part("worldstate.detectors", name, "detector", known))
+    return partial(MotionDetector, "knn" if name == "knn" else "mog2")
+
+
+@cache
+def _opened(path: Path, labels: tuple[str, ...]) -> OnnxDetector:
+    """Open a model once per process."""
+    return open_onnx(path, labels)
+
+
+def detector_name(name: str) -> str:
+    """Return the name of a detector for reports; for an ONNX model with the name of its file."""
+    return f"onnx {Path(name).name}" if name.endswith(".onnx") else name
 
 
 def _checked(part: MeasurementsPart, path: Path, name: str) -> Iterator[Timed]:

@@ -1,4 +1,4 @@
-"""Snapshots of a log in any form: JSON lines of `run --out`, MCAP, a bag of ROS 2, hops of `hear`."""
+"""Snapshots of a log: JSON lines of `run --out`, MCAP, a bag of ROS 2, or hops of `hear`."""
 
 import logging
 from collections.abc import Iterator
@@ -26,20 +26,44 @@ from worldstate.state import WorldState
 from worldstate.state.world_state import is_former
 
 _LOG = logging.getLogger(__name__)
-# A hop: the last decision of a recording ends up to so long before it does.
+# The last hop of a recording ends at most one hop before its end.
 _SLACK_NS = nanoseconds(0.1)
-# An MCAP file begins with its magic number, then the header, of which the profile comes first.
+# An MCAP file begins with its magic number and the header, whose first field is the profile.
 _HEADER_BYTES, _ROS_PROFILE = 64, b"\x04\x00\x00\x00ros2"
-PARQUET = ".parquet"  # Of the tables of `hear`
-BATCH_ROWS = 4096  # Of one of them; a row of hops has some 5 kB: 20 MB at a time
+PARQUET = ".parquet"  # Suffix of the tables of `hear`
+BATCH_ROWS = 4096  # About 20 MB, because a row of hops has about 5 kB
 _PACKED = b"\x1f\x8b"
 _EMPTY = "expected snapshots, got none: `worldstate run --out` writes them"
 
 
-def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
-    """Yield every snapshot, beside the line of JSON that was written; refuse a log without any.
+def read(log: Path | str) -> list[WorldState]:
+    """Return the world-states of a log.
 
-    One of schema 3.x is upgraded, and so is its line.
+    Parameters
+    ----------
+    log : path
+        JSON lines of `worldstate run --out`, MCAP or ROS 2 bag of `--export`, or hops of `hear` as Parquet.
+
+    Raises
+    ------
+    InputFileError
+        If the file is missing or holds no snapshot.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "states.jsonl").write_text(WorldState(100_000_000, 1).to_json())
+    ...     read(f"{folder}/states.jsonl")[0].stamp_ns
+    100000000
+    """
+    return [state for _, state in read_log(Path(log))]
+
+
+def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
+    """Yield every snapshot with its line of JSON; refuse a log without snapshots.
+
+    Snapshots of schema 3.x are upgraded, and so are their lines.
     """
     empty = True
     with refused_as_file(path):
@@ -53,7 +77,7 @@ def read_log(path: Path) -> Iterator[tuple[str, WorldState]]:
 
 
 def read_media(path: Path) -> Iterator[tuple[int, CompressedImage | RawAudio]]:
-    """Yield each image or block of sound of a log with its stamp, ns; only MCAP of `--export` holds any."""
+    """Yield each image or block of sound with its time stamp, ns; only MCAP of `--export` contains them."""
     kinds: dict[str, type[CompressedImage] | type[RawAudio]]
     kinds = {IMAGE_TOPIC: CompressedImage, SOUND_TOPIC: RawAudio}
     with refused_as_file(path):
@@ -62,8 +86,8 @@ def read_media(path: Path) -> Iterator[tuple[int, CompressedImage | RawAudio]]:
 
 
 def upgraded_messages(path: Path) -> Iterator[LogMessage]:
-    """Yield every message of an MCAP file of `--export` as this version writes it, in its order."""
-    # What follows from a snapshot is written anew; the power of the sound, images and sound are not.
+    """Yield every message of an MCAP file of `--export` in the form of this version, in order."""
+    # Messages that follow from a snapshot are made again; spatial power, images and sound are kept.
     kinds = {SRP_TOPIC: SceneUpdate, IMAGE_TOPIC: CompressedImage, SOUND_TOPIC: RawAudio}
     with refused_as_file(path):
         for stamp_ns, topic, text in read_messages(path, SNAPSHOT_TOPIC, *kinds):
@@ -82,7 +106,7 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _snapshots(path: Path) -> Iterator[str]:
-    """Yield the snapshots of a Parquet file that `worldstate hear --hops` wrote."""
+    """Yield the snapshots of a Parquet file of `worldstate hear --hops`."""
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     try:
         with parquet.ParquetFile(path) as file:
@@ -93,19 +117,19 @@ def _snapshots(path: Path) -> Iterator[str]:
 
 
 def is_own_mcap(path: Path) -> bool:
-    """Return whether a log is an MCAP file that `--export mcap` writes, and not one of ROS 2."""
+    """Return whether a log is an MCAP file of `--export mcap`, and not a bag of ROS 2."""
     if not path.is_file():
         return False
     with plain_file(path, "snapshots") as file:
         head = file.read(_HEADER_BYTES)
-    # The name of a rotated one may end with a number.
+    # The name of a rotated file may end with a number.
     return (path.suffix.lower() == ".mcap" or head.startswith(MCAP_MAGIC)) and _ROS_PROFILE not in head
 
 
 def read_state_near(path: Path, stamp_ns: int, *, anywhere: bool = False) -> WorldState:
-    """Return the snapshot of a log that is nearest to a time, which lies within the log's or anywhere."""
+    """Return the snapshot nearest to a time, which must be within the log unless `anywhere`."""
     with refused_as_file(path):
-        # Only the one that is asked for is read whole: an hour has 36,000.
+        # Only the returned snapshot is decoded: an hour has 36,000.
         first_ns = last_ns = nearest = None
         for at_ns, value in _records(path):
             first_ns, last_ns = at_ns if first_ns is None else first_ns, at_ns
@@ -118,18 +142,18 @@ def read_state_near(path: Path, stamp_ns: int, *, anywhere: bool = False) -> Wor
         if not (anywhere or first_ns - _SLACK_NS <= stamp_ns <= last_ns + _SLACK_NS):
             span = f"{seconds(first_ns):.1f} to {seconds(last_ns):.1f} s"
             got = f"got {seconds(stamp_ns):.1f} s"
-            raise InputFileError(path, f"expected a time from {span}, in which it has snapshots, {got}")
+            raise InputFileError(path, f"expected a time from {span}, the span of its snapshots, {got}")
         return WorldState.from_dict(nearest[1])
 
 
 def _json_lines(path: Path) -> Iterator[str]:
-    """Yield every line of the file, without its end; blank ones, and those cut or damaged, are left out."""
+    """Yield every line of the file without its end; skip blank, cut and damaged lines."""
     left_out = 0
     with plain_file(path, "snapshots") as file:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
-            # What keeps the last bytes of a log begins within a line; a running one ends within one.
+            # The last bytes of a log begin within a line, and a running log ends within one.
             inner = number > 1 and line.endswith((b"}\n", b"}\r\n")) and line.startswith(b"{")
-            # Written with bytes that are no text, or so long, a whole line is refused by its number.
+            # The decoder refuses a complete line without valid text, or one that is too long, by its number.
             if inner or len(line) == MOST_CHARACTERS or not _is_cut(line):
                 yield line.decode("utf-8-sig", "replace").strip()
             elif number == 1 and line.startswith(_PACKED):
@@ -137,7 +161,7 @@ def _json_lines(path: Path) -> Iterator[str]:
             else:
                 left_out += bool(line.strip())
     if left_out:
-        _LOG.warning("%s: %d lines that are cut or damaged are left out", path, left_out)
+        _LOG.warning("%s: %d cut or damaged lines are left out", path, left_out)
 
 
 def _is_cut(line: bytes) -> bool:
@@ -149,9 +173,9 @@ def _is_cut(line: bytes) -> bool:
 
 
 def _records(path: Path) -> Iterator[tuple[int, object]]:
-    """Yield stamp and content of every snapshot."""
+    """Yield time stamp and content of every snapshot."""
     for number, line in enumerate(_lines(path), start=1):
         value = decode_json(line, f"line {number}")
         stamp_ns = value.get("stamp_ns") if isinstance(value, dict) else None
-        # What has no stamp is refused by the reader of snapshots, which says what is missing.
+        # Without a time stamp, the reader of snapshots raises an error that names the missing key.
         yield stamp_ns if isinstance(stamp_ns, int) else WorldState.from_dict(value).stamp_ns, value

@@ -1,6 +1,8 @@
 # Verbs first; isort would mix them with the types.
 from .adapters.export.dataframe import to_dataframe as to_dataframe
 from .adapters.listener import listen as listen
+from .adapters.listener import run as run
+from .adapters.state_log import read as read
 from .operations.corpus.corpus_run import hear as hear
 
 # isort: split

@@ -78,7 +78,8 @@ class Audio(ABC):
         """Refuse another number of channels than microphones."""
         if expect_channels is not None and self.channels != expect_channels:
             expected = f"expected {expect_channels} channels, one per microphone"
-            way_out = "; --channels selects the microphones" if self.channels > expect_channels else ""
+            way_out = '; "channels" in the JSON file of the array selects the microphones'
+            way_out = way_out if self.channels > expect_channels else ""
             raise InputFileError(self.path, f"{expected}, got {self.channels}{way_out}")
 
     def check_size(self, expect_channels: int | None) -> None:
@@ -410,7 +411,7 @@ def check_encoding(name: str, data: bytes, stated: Encoding, channels: int) -> N
 SoundInput: TypeAlias = Path | tuple[Path, ...] | SoundStream | Audio
 
 
-def as_sound(given: SoundInput | str | Sequence[str]) -> SoundInput:
+def as_sound(given: SoundInput | str | Sequence[Path | str]) -> SoundInput:
     """Convert strings to paths; a sequence of one path is this file."""
     if isinstance(given, Path | SoundStream | Audio):
         return given

@@ -624,7 +624,7 @@ def read_any_detections(
     text = read_text(name, "a detections file", MAX_BYTES)
     if _PER_FRAME.search(text) is not None:
         if n_images is not None:
-            raise InputFileError(name, "expected no number of images (--images): the file has every image")
+            raise InputFileError(name, "expected no number of images (n_images): the file has every image")
         return _ovad_log(name, text, frame_rate_hz)
     try:
         with refused_as_file(name):
@@ -688,7 +688,7 @@ def coco_log(
     if unscored := sum(one.score is None for one in read.annotations):
         _LOG.warning("%s: %d boxes without a score count with 1.0", path, unscored)
     if listed and n_images is not None:
-        raise InputFileError(path, "expected no number of images (--images): the file lists its images")
+        raise InputFileError(path, "expected no number of images (n_images): the file lists its images")
     return _log(path, rows, frame_rate_hz, sorted(rows) if listed else n_images)
 
 
@@ -879,8 +879,8 @@ def _numbers_up_to_the_last(path: Path, named: Collection[int], *, stated: bool)
         return range(steps.stop)
     if not stated:
         problem = f"expected images that are numbered by ones, these rise by {steps.step}, as times do"
-        way_on = "state how many of these numbers a second has (--image-rate, image_rate_hz, frame_rate_hz)"
-        raise InputFileError(path, f"{problem}: {way_on}, or the number of images (--images)")
+        way_on = "state how many of these numbers a second has (image_rate_hz of the camera, frame_rate_hz)"
+        raise InputFileError(path, f"{problem}: {way_on}, or the number of images (n_images)")
     return range(steps.start % steps.step, steps.stop, steps.step)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
-from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.array_file import named_arrays, read_array
 from worldstate.adapters.files.array_match import array_difference, microphone_order
 from worldstate.adapters.files.file_io import read_json, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
@@ -273,10 +273,13 @@ def check_channels(path: Path, array: MicrophoneArray) -> None:
     """
     with open_audio(path, strict=False) as audio:
         if audio.channels != array.n_microphones:
-            wanted = f"expected --array FILE, or {ARRAY_NAME} beside it, for its {audio.channels} channels"
-            other = f"{array.name}, the array of the model, has {array.n_microphones}"
-            ways = "`worldstate array bearings` needs no model; `worldstate model make` makes one for it"
-            raise InputFileError(path, f"{wanted}; {other}. With it {ways}")
+            boards = ", ".join(named_arrays())
+            wanted = (
+                f"expected --array (array=) for its {audio.channels} channels: a file, or one of {boards}"
+            )
+            other = f"the default, {array.name}, has {array.n_microphones}; {ARRAY_NAME} beside it works, too"
+            ways = "`worldstate model make` makes a model for it, `worldstate array bearings` needs none"
+            raise InputFileError(path, f"{wanted}; {other}. With the array {ways}")
 
 
 def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:

@@ -287,7 +287,8 @@ def audio_packets(
     """Yield the packet of each message of a topic; refuse changes of format and a topic without messages."""
     kind, first = bag.kind_of(topic), None
     if kind == types.AUDIO and stated is not None:
-        raise InputFileError(bag.path, f"expected no --audio-format: messages of {kind} contain theirs")
+        problem = f"expected no format beside the topic: messages of {kind} contain theirs"
+        raise InputFileError(bag.path, problem)
     if stated is None and kind in (types.STAMPED_PCM, types.PCM):
         stated = _pcm_info(bag, topic)
     for recorded_ns, message in bag.messages(topic):
@@ -308,7 +309,7 @@ def _pcm_info(bag: BagReader, topic: str) -> sound_file.RawPcm:
     where = bag.topic("the topic of AudioInfo", None, types.PCM_INFO)
     said = None if where is None else next(bag.messages(where), None)
     if said is None:
-        wanted = f"{types.PCM_INFO} beside {topic}, or --audio-format RATE:CHANNELS:FORMAT of its bytes"
+        wanted = f"{types.PCM_INFO} beside {topic}, or --topic audio={topic}:RATE:CHANNELS:FORMAT"
         raise InputFileError(bag.path, f"expected {wanted}")
     info = said[1]
     if info.coding_format.lower() not in ("wave", "raw", ""):
@@ -507,7 +508,7 @@ def _on_samples(
     stamps_ns = stamps_ns + added_ns
     lost_ns, early_ns = lost_before(stamps_ns, lengths_ns)
     if told := contradiction(stamps_ns, lengths_ns, lost_ns):
-        problem = f"{sound.topic}: {told}: another rate (--audio-format), or a bag that was played in a loop"
+        problem = f"{sound.topic}: {told}: another rate (--topic), or a bag that was played in a loop"
         raise InputFileError(sound.path, f"{problem} whose passes the recorder mixed: record one pass")
     return replace(
         sound,

@@ -1,6 +1,5 @@
 """The grounded likelihood in the running chain: switched, off by default, each tie seen at work."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -16,9 +15,8 @@ from worldstate.abduction.grounding.grounded_likelihood import (
     car,
 )
 from worldstate.adapters.acoustic import AcousticAdapter, Grounding, observe
-from worldstate.adapters.listener import measure_steps
+from worldstate.adapters.listener import measure_steps, run
 from worldstate.adapters.source import ListenSettings, open_source
-from worldstate.cli.main import main
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
 from worldstate.frontend.array.microphone_array import roof_array_56
@@ -116,11 +114,7 @@ def test_the_whole_chain_runs_grounded(approach):
 
 
 @pytest.mark.long
-def test_run_has_the_switch(approach, tmp_path):
-    # The windows are weighed otherwise; the sequence, which the risk goes by, reads them as they are.
-    ratios = []
-    for option in ([], ["--grounded"]):
-        out = tmp_path / "states.jsonl"
-        assert main(["run", str(approach.folder), *option, "--out", str(out)]) == 0
-        ratios.append([json.loads(line)["cues"][0]["log_lambda"] for line in out.read_text().splitlines()])
-    assert ratios[0] != ratios[1]
+def test_grounding_changes_the_likelihood_ratios_of_a_run(approach):
+    asked = ListenSettings(), ListenSettings(grounding=Grounding())
+    plain, grounded = (run(approach.folder, settings=one) for one in asked)
+    assert [one.cues[0].log_lambda for one in plain] != [one.cues[0].log_lambda for one in grounded]

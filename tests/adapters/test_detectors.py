@@ -302,7 +302,7 @@ def test_what_a_tracker_writes_is_read_frame_by_frame(tracks, looks, tmp_path_fa
     # Numbers that rise by more than one are those of every so many-th image.
     assert seen.tolist() == [*range(named[0] % step if named else 0, told, step)]
     if step > 1:
-        with pytest.raises(InputFileError, match=rf"rise by {step}.*--image-rate"):
+        with pytest.raises(InputFileError, match=rf"rise by {step}.*image_rate_hz"):
             read_any_detections(path)
     with pytest.raises(InputFileError, match=r"images by its boxes"):
         read_any_detections(path, n_images=told - 1)

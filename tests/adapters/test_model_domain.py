@@ -88,7 +88,7 @@ def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(
     monkeypatch.setattr(arrays, "MODELS", tmp_path)
     sound = 0.01 * np.random.default_rng(0).standard_normal((40_000, 7))
     soundfile.write(tmp_path / "own.wav", sound, 16_000)
-    run = ["run", str(tmp_path / "own.wav"), "--array", "xmos", "--channels", "1-7", "--json"]
+    run = ["run", str(tmp_path / "own.wav"), "--array", "xmos", "--json"]
     assert Listener("xmos", 16_000).push(sound)[-1].no_model is not None
     assert "worldstate model make" in caplog.text
     assert main(run) == 0 and "(no model 16)" in capsys.readouterr().out
@@ -223,7 +223,7 @@ def test_a_model_unfit_for_use_states_no_budget_and_keeps_saying_so(
     state = next(listen(alone, model=path))
     assert not state.calibrated and [cue.alpha for cue in state.cues] == [None, None]
     assert "unfit for use" in caplog.text
-    assert main(["model", str(path)]) == 0
+    assert main(["model", "show", str(path)]) == 0
     assert "unfit for use" in capsys.readouterr().out
     # Nor is it taken for another array than its own.
     with pytest.raises(OutOfDomainError):
@@ -268,7 +268,7 @@ def test_a_drive_outside_is_named_once_and_begins_no_advisory(
     alone: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     fast = OdometryLog((Odometry("wheels", 0, 12.0), Odometry("wheels", 1_500_000_000, 3.0)))
-    states = [*listen(alone, ego=fast)]
+    states = [*listen(alone, odometry=fast)]
     told = [one for one in caplog.messages if "faster than the model learned" in one]
     assert len(told) == 1 and "12.0 m/s" in told[0] and "8.3" in told[0]
     assert not [cue for one in states for cue in one.cues if one.stamp_ns < 1.5e9 and cue.advisory]
@@ -432,7 +432,7 @@ def test_a_table_and_the_model_trained_on_it_say_what_they_were_made_with(
     assert read_features(tmp_path / "t.csv").domain is None
     capsys.readouterr()
     assert main(train) == 0
-    assert "names no array: taken as OVAD's" in capsys.readouterr().err
+    assert "states no array: taken as OVAD's" in capsys.readouterr().err
     domain = read_model(tmp_path / "m.json").domain
     assert domain is not None and np.array_equal(domain.positions_m, HERE)
 
@@ -499,7 +499,7 @@ def test_evaluate_refuses_a_model_of_another_array(
 
 
 @pytest.mark.parametrize(
-    "show", [lambda: main(["model", "--json"]), lambda: main(["model"])], ids=["json", "text"]
+    "show", [lambda: main(["model", "show", "--json"]), lambda: main(["model", "show"])], ids=["json", "text"]
 )
 def test_the_card_of_a_model(show: Callable[[], int], capsys: pytest.CaptureFixture[str]) -> None:
     assert show() == 0

@@ -85,9 +85,9 @@ def test_stamps_on_another_clock_are_refused_and_the_offset_brings_them_back(
 def test_odometry_on_another_clock_is_refused(sound: Path, off_s: float) -> None:
     told = tuple(Odometry("wheels", nanoseconds(off_s + 0.1 * i), 0.1) for i in range(201))
     with pytest.raises(InputFileError, match=r"wheels: expected stamps on the clock .* s more .*--start"):
-        heard(sound, ego=OdometryLog(told))
+        heard(sound, odometry=OdometryLog(told))
     if off_s > 0.0:
-        heard(sound, off_s, ego=OdometryLog(told))
+        heard(sound, off_s, odometry=OdometryLog(told))
 
 
 def test_what_overlaps_is_taken_as_it_is(sound: Path) -> None:
@@ -119,12 +119,12 @@ def test_stamps_in_another_unit_are_refused(sound: Path, unit: str, first_s: flo
 def test_odometry_in_another_unit_is_refused(sound: Path, by: float) -> None:
     told = tuple(Odometry("wheels", nanoseconds(0.1 * i * by), 0.1) for i in range(201))
     with pytest.raises(InputFileError, match=r"wheels: expected stamps in nanoseconds, times in seconds"):
-        heard(sound, ego=OdometryLog(told))
+        heard(sound, odometry=OdometryLog(told))
 
 
 @pytest.mark.parametrize(
     ("first_s", "last_s", "told"),
-    [(0.0, 20.0, ""), (-3.0, 22.0, ""), (4.0, 19.0, ""), (15.0, 35.0, "cover 5.0 of 20.0 s"),
+    [(0.0, 20.0, ""), (-3.0, 22.0, ""), (4.0, 19.0, ""), (15.0, 35.0, "cover 5.0 of its 20.0 s"),
      (0.0, 6.0, "60 of 60 stamps"), (-30.0, 60.0, "of 900 stamps lie within the sound")],
 )  # fmt: skip
 def test_what_hardly_lies_beside_the_sound_draws_a_line(
@@ -134,7 +134,7 @@ def test_what_hardly_lies_beside_the_sound_draws_a_line(
     heard(sound, detections=DetectionLog((NONE,) * len(stamps), stamps))
     assert told in caplog.text and bool(told) == bool(caplog.text)
     caplog.clear()
-    heard(sound, ego=OdometryLog(tuple(Odometry("wheels", int(ns), 0.1) for ns in stamps)))
+    heard(sound, odometry=OdometryLog(tuple(Odometry("wheels", int(ns), 0.1) for ns in stamps)))
     assert told in caplog.text and bool(told) == bool(caplog.text)
 
 
@@ -151,7 +151,7 @@ def test_a_rate_near_the_one_assumed_draws_a_line(
 
 def test_a_sensor_that_measured_nothing_draws_a_line(sound: Path, caplog: pytest.LogCaptureFixture) -> None:
     heard(sound, others=[partial(lambda path, name: iter(()), "r.csv", name="radar")])
-    assert "radar: no measurement in it" in caplog.text
+    assert "radar: has no measurement" in caplog.text
 
 
 # Odometry of a drive at 10 m/s around a curve, and what others write of it.
@@ -216,7 +216,7 @@ def test_a_rate_that_nobody_stated_has_to_fit_the_sound(
     if written is mot_text and rate_hz < 10.0:
         heard(sound, detections=path)  # Lines do not end with the images
         return
-    with pytest.raises(InputFileError, match="--image-rate, image_rate_hz"):
+    with pytest.raises(InputFileError, match="image_rate_hz of the camera"):
         heard(sound, detections=path)
     log = read_any_detections(path, rate_hz, (1936, 1216))
     last_s = seconds(int((heard(sound, detections=log).detections or log).stamps_ns[-1]))
@@ -231,29 +231,22 @@ def test_ten_a_second_and_a_camera_that_stopped_earlier_are_read(
     assert len(heard(sound, detections=written(tmp_path, images)).detections or ()) == images
 
 
-def test_the_rate_is_an_option_and_a_key_of_the_camera(tmp_path: Path) -> None:
-    from worldstate.cli.common.sensors import given_sensors
-    from worldstate.cli.main import PROGRAM
-
-    path = str(ovad_json(tmp_path, 60))
+def test_the_rate_is_a_key_of_the_camera(sound: Path, tmp_path: Path) -> None:
+    path = ovad_json(tmp_path, 60)
     lens = {"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68, "position_m": [0, 0, 0]}
+    (tmp_path / "plain.json").write_text(json.dumps(lens))
     (tmp_path / "c.json").write_text(json.dumps(lens | {"image_rate_hz": 15}))
 
-    def read(*more: str) -> tuple[float | None, bool]:
-        words = ["run", "a.wav", "--detections", path, *more]
-        log = given_sensors(PROGRAM.parser("run").parse_args(words[1:])).detections()
-        log = log if isinstance(log, DetectionLog) else read_any_detections(str(log))
+    def read(camera: Path) -> tuple[float | None, bool]:
+        log = open_source(sound, ARRAY, detections=path, camera=camera, uncalibrated=True).detections
+        assert log is not None
         return log.counted_hz, log.assumed
 
-    assert read() == (10.0, True)
-    assert read("--image-rate", "10") == (10.0, False)
-    assert read("--camera", str(tmp_path / "c.json")) == (15.0, False)
-    assert read("--camera", str(tmp_path / "c.json"), "--image-rate", "30") == (30.0, False)
+    assert read(tmp_path / "plain.json") == (10.0, True)
+    assert read(tmp_path / "c.json") == (15.0, False)
     stamped = [EMPTY | {"stamp_ns": 10**8 * i} for i in range(9)]
     (tmp_path / "ovad.json").write_text(json.dumps({"detections_per_frame": stamped}))
-    assert read("--camera", str(tmp_path / "c.json")) == (None, False)
-    with pytest.raises(InvalidArgumentError, match="--image-rate: expected images without stamps"):
-        read("--image-rate", "30")
+    assert read(tmp_path / "c.json") == (None, False)
 
 
 # Names of label files as exporters write them, each with the tenths of a second at which the images were
@@ -287,7 +280,7 @@ def test_names_of_labels_are_numbers_only_where_they_form_a_sequence(tmp_path: P
     for one in names:
         (tmp_path / f"{one}.txt").write_text("2 0.5 0.5 0.1 0.2 0.9\n")
     if expected is None:
-        with pytest.raises(InputFileError, match=r"--image-rate|file_name|stamp_ns"):
+        with pytest.raises(InputFileError, match=r"image_rate_hz|file_name|stamp_ns"):
             read_any_detections(tmp_path, size_px=(640, 480))
         return
     log = read_any_detections(tmp_path, size_px=(640, 480))

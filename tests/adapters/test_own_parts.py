@@ -74,8 +74,8 @@ def test_a_sensor_of_ones_own_places_who_is_only_heard(own_parts, approach, tmp_
     ]
     beacons, out = tmp_path / "v2x.jsonl", tmp_path / "states.jsonl"
     beacons.write_text("".join(json.dumps(one) + "\n" for one in messages))
-    measured = ["--measurements", f"v2x={beacons}", "--out", str(out)]
-    assert main(["run", str(approach.folder), *measured]) == 0
+    (tmp_path / "car.json").write_text('{"measurements": {"v2x": "v2x.jsonl"}}')
+    assert main(["run", str(approach.folder), "--car", str(tmp_path / "car.json"), "--out", str(out)]) == 0
     after = [json.loads(line) for line in out.open()]
     at_3 = next(state for state in after if state["stamp_ns"] == 3_000_000_000)
     (placed,) = (one for one in at_3["entities"] if one["position_m"] is not None)
@@ -141,12 +141,14 @@ def test_a_name_that_nobody_brings_is_refused_with_those_that_are_there(
     own_parts, log, approach, tmp_path, capsys
 ):
     replay, run = ["log", "replay", str(log)], ["run", str(approach.folder)]
+    for name in ("radar", "v2x"):
+        (tmp_path / f"{name}.json").write_text(json.dumps({"measurements": {name: "none.jsonl"}}))
     for options, said in (
         ([*replay, "--export", "sheet=a.csv"], "rosbag-sqlite3, table), got 'sheet'"),
         ([*replay, "--export", "table"], "--export: expected NAME=TARGET, got 'table'"),
-        ([*run, "--measurements", "radar=a"], "worldstate.measurements (v2x), got 'radar'"),
+        ([*run, "--car", str(tmp_path / "radar.json")], "worldstate.measurements (v2x), got 'radar'"),
         (
-            [*run, "--measurements", f"v2x={tmp_path / 'none.jsonl'}"],
+            [*run, "--car", str(tmp_path / "v2x.json")],
             "v2x: expected a part that works, got FileNotFoundError",
         ),
         ([*run, "--detector", "yolo"], "worldstate.detectors (motion, knn, FILE.onnx, moving-columns), got"),

@@ -20,7 +20,6 @@ from worldstate.adapters.acoustic import AcousticAdapter
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
 from worldstate.adapters.listener import listen_steps, measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
-from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 
@@ -184,11 +183,6 @@ def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model, monkeypatch):
     assert on[~hazard].mean() <= off[~hazard].mean() + 0.01
 
 
-@pytest.mark.long
-def test_run_has_the_switch(approach, capsys):
-    peaks = []
-    for option in ([], ["--site-memory", "0"], ["--site-memory", "5"]):
-        assert main(["run", str(approach.folder), *option, "--json"]) == 0
-        peaks.append(json.loads(capsys.readouterr().out)["peak_risk"])
-    assert all(0.0 <= peak <= 1.0 for peak in peaks)
-    assert main(["run", str(approach.folder), "--site-memory", "-1"]) == 2
+def test_a_wrong_time_constant_is_refused():
+    with pytest.raises(InvalidArgumentError, match="forgetting_s"):
+        ListenSettings(forgetting_s=-1.0)

@@ -122,7 +122,7 @@ def test_the_commands_state_bearings_and_say_that_there_is_no_model(
         == 0
     )
     assert "no model" in capsys.readouterr().out
-    for asked in (["--budget", "5"], ["--alpha", "0.02"], ["--grounded"]):
+    for asked in (["--budget", "5"], ["--alpha", "0.02"]):
         assert main(["run", *words, *asked]) == 2
         assert "expected a model for the array" in capsys.readouterr().err
     quiet = ["model", "threshold", *words, "--out", str(tmp_path / "m.json")]

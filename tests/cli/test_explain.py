@@ -175,7 +175,7 @@ def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, onset,
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--time 7.5", "expected a time from 0.1 to 1.5 s, in which it has snapshots, got 7.5 s"),
+        ("--time 7.5", "expected a time from 0.1 to 1.5 s, the span of its snapshots, got 7.5 s"),
         ("--time -1", "expected a time from 0.1 to 1.5 s"),
         ("--time 1 --side up", "--side: expected one of left, right, got 'up'"),
         ("--time nan", "--time"),
@@ -242,7 +242,7 @@ def test_damage_costs_the_lines_that_have_it_and_is_told_once(name, states, tmp_
     ):
         assert main(command) == 0
         told = capfd.readouterr().err.splitlines()
-        expected = f"damaged.jsonl: {cost} lines that are cut or damaged are left out"
+        expected = f"damaged.jsonl: {cost} cut or damaged lines are left out"
         assert [one.rpartition("/")[2] for one in told] == [expected] * bool(cost)
     again = (tmp_path / "again.jsonl").read_bytes().splitlines(keepends=True)
     assert len(again) == len(lines) - cost and set(again) <= set(lines)

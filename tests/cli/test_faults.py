@@ -132,7 +132,10 @@ def test_an_output_that_cannot_be_is_refused_before_the_work(line, named, files,
         ("live --detector knn --camera-device 0", "--array: expected the positions of the microphones"),
         ("sim make --out new --bandwidth 17000", "bandwidth_hz: expected a number in [700.0, 16000.0]"),
         ("sim make --out new --minutes 1 --bandwidth 17000", "--bandwidth: expected a number in [700.0, 16"),
-        ("run a.wav --images 5", "--images: expected --detections with it"),
+        (
+            "run a.wav --images 5",
+            "--images: expected images, a key of COCO results in --detections in its",
+        ),
         ("log replay m.json --export mcap=b --export mcap=b", "b: expected another file"),
         ("log replay m.json --export osi=m.json --export osi=b", "m.json: expected another file"),
     ],
@@ -152,7 +155,7 @@ def test_the_boxes_of_one_recording_are_not_those_of_several(tmp_path, capsys):
     for command in (["array", "align"], ["street", "learn", "--out", str(tmp_path / "s.json")]):
         for given in (["--car", "car.json"], ["--detections", "boxes.json"]):
             words = [*command, *several, given[0], str(tmp_path / given[1])]
-            assert "expected one recording with boxes" in refusal(words, tmp_path, capsys)
+            assert "expected one recording with --detections or --car" in refusal(words, tmp_path, capsys)
 
 
 def test_reference_boxes_of_one_video_are_not_those_of_several(tmp_path, capsys):

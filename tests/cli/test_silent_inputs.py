@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import soundfile
 
-from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.cli.main import main
 
 LENGTH_S = 3.0
@@ -33,26 +32,23 @@ def stamped(first_s: float, unit: float = 1e9) -> object:
 
 # What is given beside the sound: an option and its file's content, or its words; and what is said of it.
 SILENT: dict[str, tuple[Mapping[str, object], str]] = {
-    "boxes of no image": ({"--detections d.json": NOTHING}, "no image was looked at"),
-    "results of no box": ({"--detections d.json": []}, "no image was looked at"),
-    "a list of no image": ({"--detections d.json": {"images": [], "annotations": []}}, "no image was looked"),
+    "boxes of no image": ({"--detections d.json": NOTHING}, "searched no image"),
+    "results of no box": ({"--detections d.json": []}, "searched no image"),
+    "a list of no image": ({"--detections d.json": {"images": [], "annotations": []}}, "searched no image"),
     "one image listed": (
         {"--detections d.json": {"images": [{"id": 0}], "annotations": []}},
         "1 of 1 stamps",
     ),
-    "MOTChallenge text, empty": ({"--detections d.txt": ""}, "no image was looked at"),
+    "MOTChallenge text, empty": ({"--detections d.txt": ""}, "searched no image"),
     "boxes that do not count": (
         {"--detections d.json": {"detections_per_frame": [TRUCK] + [EMPTY] * 29}},
         "none of its boxes has counted yet",
     ),
     "boxes of another day": ({"--detections d.json": stamped(86_400.0)}, "stamp_offset_s"),
     "boxes in milliseconds": ({"--detections d.json": stamped(0.0, 1e3)}, "in another unit"),
-    "boxes of an hour before": ({"--detections d.json": [{**BOX, "image_id": 36_000}]}, "--image-rate"),
+    "boxes of an hour before": ({"--detections d.json": [{**BOX, "image_id": 36_000}]}, "image_rate_hz"),
     "boxes of the last hop": ({"--detections d.json": stamped(2.9)}, "of 30 stamps lie within the sound"),
-    "a rate beside stamps": ({"--detections d.json": stamped(0.0), "--image-rate": "30"}, "without stamps"),
-    "images that are listed": ({"--detections d.json": ASKED, "--images": "30"}, "every image"),
     "a camera alone": ({"--camera c.json": LENS}, "--camera without --detections"),
-    "miss rates alone": ({"--miss-rates rates.json": None}, "--miss-rates without --detections"),
     "a camera of a car alone": ({"--car car.json": {"cameras": [FRONT]}}, "cameras of --car without"),
     "an empty car": ({"--car car.json": {}}, "no array, camera, model, odometry or measurements"),
     "a car's name": ({"--car car.json": {"name": "mine"}}, "no array, camera"),
@@ -65,7 +61,7 @@ SILENT: dict[str, tuple[Mapping[str, object], str]] = {
                 ]
             }
         },
-        "rear: no image was looked at",
+        "rear: the detector searched no image",
     ),
     "an empty context": ({"--context x.json": {}}, "it is empty"),
     "odometry, empty": ({"--odometry o.csv": odometry()}, "at least one line"),
@@ -78,9 +74,8 @@ SILENT: dict[str, tuple[Mapping[str, object], str]] = {
         {"--odometry o.csv": odometry(*range(0, 3000, 100))},
         "in another unit",
     ),
-    "a topic without a bag": ({"--topic": "detections=/boxes"}, "--topic: expected a bag"),
-    "a format without a bag": ({"--audio-format": "48000:4:s16"}, "--audio-format: expected a bag"),
-    "sound that was heard before": ({"--resume state.json": None}, "all of the sound was heard before"),
+    "a topic without a bag": ({"--topic": "detections=/boxes"}, "topics: expected a bag"),
+    "sound that was heard before": ({"--resume state.json": None}, "all of this sound was used before"),
 }
 
 
@@ -92,8 +87,6 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     soundfile.write(folder / "a.wav", sound, 48_000)
     (folder / "asked.json").write_text(json.dumps(ASKED))
     (folder / "nothing.json").write_text(json.dumps(NOTHING))
-    counts = FamilyCounts(((10,) * 5,), ((0, 1, 2, 5, 10),), (99,) * 5, (0,) * 5)
-    save_miss_rates(folder / "rates.json", MissRates((0.0, 30.0), {"noise": counts}))
     assert main(["run", str(folder / "a.wav"), "--save-state", str(folder / "state.json")]) == 0
     return folder
 

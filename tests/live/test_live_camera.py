@@ -235,7 +235,7 @@ def test_a_callback_that_fails_or_gives_none_costs_its_image(source, own):
         problems.append(looks.problem)
     assert looks.refused + sum("mine: expected a part" in one for one in problems) == 6
     assert "expected images, got NoneType" in problems[0]
-    assert "expected a DetectionFrame, got None" in problems[2]
+    assert "ultralytics, got None" in problems[2]
     assert "no memory on the card" in problems[3]
     assert [seen.label for seen in camera.sightings(nanoseconds(0.6))] == ["car"]
 

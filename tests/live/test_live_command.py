@@ -62,7 +62,7 @@ def test_sound_is_kept_where_asked_for(street, tmp_path):
 
 def test_kept_sound_never_replaces_what_is_played(street, capsys):
     assert main(command(street, "--keep-sound", street / "street.wav")) == 2
-    assert "this one is read" in capsys.readouterr().err
+    assert "this one is an input" in capsys.readouterr().err
 
 
 def test_losses_are_said_when_they_happen(street, capsys, monkeypatch):
@@ -229,7 +229,7 @@ def test_several_cameras_are_asked_and_a_box_outside_an_image_is_refused(street,
 
 
 @pytest.mark.parametrize("command_name", ["live", "run"])
-def test_odometry_chooses_the_model_of_a_moving_ego_and_says_so(street, tmp_path, capsys, command_name):
+def test_odometry_chooses_the_model_of_a_moving_ego_and_says_so(street, tmp_path, caplog, command_name):
     positions_m = np.loadtxt(street / "mics.csv", delimiter=",").tolist()
     (tmp_path / "odometry.csv").write_text("time_s,speed_mps\n0,4\n")
     play = ["--speed", "20", "--play"] if command_name == "live" else []
@@ -239,7 +239,7 @@ def test_odometry_chooses_the_model_of_a_moving_ego_and_says_so(street, tmp_path
         states = tmp_path / "states.jsonl"
         sound, given = str(street / "street.wav"), ["--car", str(tmp_path / "car.json"), "--uncalibrated"]
         assert main([command_name, *play, sound, *given, "--out", str(states)]) == 0
-        assert ("model of a moving ego" in capsys.readouterr().err) == moves
+        assert ("model of a moving ego" in caplog.text) == moves
         last = json.loads(states.read_text().splitlines()[-1])
         assert last["context"]["ego_speed_mps"] == (4.0 if moves else None)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.live import live_sound
 from worldstate.adapters.live.live_sound import LiveSound, MissingPortAudioError, PortAudioInput, portaudio
 from worldstate.cli.main import main
@@ -153,7 +154,10 @@ def test_the_command_records_from_the_device_until_the_duration(stand_in, tmp_pa
 
 @pytest.mark.parametrize(
     ("given", "opened"),
-    [('{"positions_m": [[0, 0.1, 0], [0, -0.1, 0.05]], "channels": [4, 2]}', 4), ("0,0.1,0\n0,-0.1,0.05", 3)],
+    [
+        ('{"positions_m": [[0, 0.1, 0], [0, -0.1, 0.05]], "channels": [4, 2]}', 4),
+        ('{"positions_m": [[0, 0.1, 0], [0, -0.1, 0.05]], "channels": [3, 1]}', 3),
+    ],
 )
 def test_the_command_hears_the_channels_that_microphones_are_on(
     stand_in, tmp_path, capsys, monkeypatch, given, opened
@@ -171,7 +175,6 @@ def test_the_command_hears_the_channels_that_microphones_are_on(
 
     monkeypatch.setattr(PortAudioInput, "start", start)
     kept, options = tmp_path / "kept.wav", ["--array", str(tmp_path / "mics"), "--uncalibrated"]
-    options += ["--channels", "3,1"] if opened == 3 else []
     live = ["--rate", str(RATE), "--duration", "1.2", "--keep-sound", str(kept)]
     assert main(["live", *options, *live]) == 0
     assert stand_in.stream.channels == opened
@@ -195,10 +198,12 @@ def test_a_recording_with_more_channels_is_played(tmp_path, capsys):
     soundfile.write(tmp_path / "card.wav", sound, RATE)
     soundfile.write(tmp_path / "chosen.wav", sound[:, [4, 2, 3, 1]], RATE)
     found = []
-    for name, channels in (("card.wav", ["--channels", "5,3,4,2"]), ("chosen.wav", [])):
+    positions_m = read_array("respeaker-4").positions_m.tolist()
+    for name, channels in (("card.wav", [5, 3, 4, 2]), ("chosen.wav", [1, 2, 3, 4])):
         out = tmp_path / "states.jsonl"
-        command = ["live", "--play", str(tmp_path / name), "--array", "respeaker-4", "--uncalibrated"]
-        assert main([*command, *channels, "--speed", "20", "--out", str(out)]) == 0
+        (tmp_path / "mics.json").write_text(json.dumps({"positions_m": positions_m, "channels": channels}))
+        command = ["live", "--play", str(tmp_path / name), "--array", str(tmp_path / "mics.json")]
+        assert main([*command, "--uncalibrated", "--speed", "20", "--out", str(out)]) == 0
         bearings = [json.loads(line).get("evidence") for line in out.read_text().splitlines()]
         found.append(bearings)
     assert found[0] == found[1]

@@ -126,7 +126,7 @@ def test_the_command_learns_goes_on_and_run_takes_it(approach, tmp_path, capsys)
     # A day takes a thirtieth of the weight.
     assert again.arms[0].exposure_s == pytest.approx(first.arms[0].exposure_s * (1.0 + math.exp(-1 / 30)))
     states = tmp_path / "states.jsonl"
-    assert main(["run", str(approach.folder), "--street", str(out), "--out", str(states)]) == 0
+    assert main(["run", str(approach.folder), "--context", str(out), "--out", str(states)]) == 0
     context = json.loads(states.read_text().splitlines()[-1])["context"]
     assert context["site"] == "here"
 
@@ -135,8 +135,3 @@ def test_boxes_are_of_one_recording(approach, capsys):
     inputs = [str(approach.folder)] * 2
     assert main(["street", "learn", *inputs, "--detections", "a.json", "--out", "b.json"]) == 2
     assert "--detections" in capsys.readouterr().err
-
-
-def test_a_place_is_said_once(approach, capsys):
-    assert main(["run", str(approach.folder), "--street", "a.json", "--context", "b.json"]) == 2
-    assert "--street" in capsys.readouterr().err

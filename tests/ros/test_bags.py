@@ -246,7 +246,7 @@ def test_the_camera_of_a_bag_labels_its_street(approach, bag_of_approach, tmp_pa
     assert t0_of_bag_s - t0_s == pytest.approx(1_700_000_000, abs=1e-3)
     windows = ["--out", str(tmp_path / "c"), "--windows", str(tmp_path / "labels.csv")]
     assert main(["street", "label", str(bag_of_approach), *windows]) == 2
-    assert "--windows: expected none of a bag" in capsys.readouterr().err
+    assert "--windows: expected none for a bag" in capsys.readouterr().err
 
 
 def test_sound_comes_back_sample_for_sample_in_either_layout(tmp_path):
@@ -549,7 +549,7 @@ def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
     source = open_source(
         read_bag(path).sound,
         array=MicrophoneArray([[0, y, 0] for y in (0.1, 0.05, -0.05, -0.1)]),
-        ego=OdometryLog(tuple(told)),
+        odometry=OdometryLog(tuple(told)),
         settings=ListenSettings(uncalibrated=True),
     )
     said = {step.state.stamp_ns: step.state.context.ego_speed_mps for step in listen_steps(source)}
@@ -587,7 +587,7 @@ def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
         ("nan", ["--array", str(array)], "expected finite samples, got nan in channel 3, sample 900"),
         ("changing", ["--array", str(four)], "expected 8000 Hz and 4 channels as in the first message"),
         ("four", ["--array", str(array), "--uncalibrated"], "expected 3 channels, one per microphone, got 4"),
-        ("four", ["--array", str(array), "--start", "3"], "--start: expected none with a bag"),
+        ("four", ["--array", str(array), "--start", "3"], "start_s: expected none with a bag"),
         ("four", ["--array", str(array), "--topic", "detections=/x"], "on /x (--topic detections=), got"),
         (
             "four",

@@ -248,7 +248,7 @@ def test_stamps_and_rate_that_contradict_each_other_are_refused(
     case: str, info: dict[str, int], stretch: int, said: str, tmp_path: Path
 ) -> None:
     path = write_bag(tmp_path / "bag", T0 + np.arange(600) // stretch * 10 * MS, info=info)
-    with pytest.raises(InputFileError, match=re.escape(said) + ".*--audio-format"):
+    with pytest.raises(InputFileError, match=re.escape(said) + ".*--topic"):
         read_sound(path)
 
 
@@ -257,19 +257,19 @@ def test_the_format_of_bytes_may_be_stated(tmp_path: Path, capsys: pytest.Captur
     wrong = write_bag(tmp_path / "wrong", even(600)[0], info={"sample_rate": 24_000})
     array = tmp_path / "ring.csv"
     array.write_text("0.05,0,0\n0,0.05,0\n-0.05,0,0\n0,-0.05,0\n")
-    with pytest.raises(InputFileError, match=r"AudioInfo.* or --audio-format RATE:CHANNELS:FORMAT"):
+    with pytest.raises(InputFileError, match=r"AudioInfo.* or --topic audio=.*:RATE:CHANNELS:FORMAT"):
         read_sound(bare)
     for path in (bare, wrong):
         np.testing.assert_array_equal(heard(path, FORMAT), SOUND)
         words = ["array", "bearings", str(path), "--array", str(array), "--out", str(tmp_path / "b.csv")]
-        assert main([*words, "--audio-format", "8000:4:s16"]) == 0
+        assert main([*words, "--topic", "audio=:8000:4:s16"]) == 0
         assert len((tmp_path / "b.csv").read_text().splitlines()) == 52
         capsys.readouterr()
-        assert main([*words, "--audio-format", "8000:4"]) in (0, 2)
-        assert main([*words, "--audio-format", "8k:4:s16"]) == 2
-        assert "--audio-format: expected RATE:CHANNELS:FORMAT" in capsys.readouterr().err
-    assert main(["array", "check", "a.wav", "--array", str(array), "--audio-format", "8000:4:s16"]) == 2
-    assert "--audio-format: expected a bag" in capsys.readouterr().err
+        assert main([*words, "--topic", "audio=:8000:4"]) in (0, 2)
+        assert main([*words, "--topic", "audio=:8k:4:s16"]) == 2
+        assert "topics: expected RATE:CHANNELS:FORMAT" in capsys.readouterr().err
+    assert main(["array", "check", "a.wav", "--array", str(array), "--topic", "audio=:8000:4:s16"]) == 2
+    assert "topics: expected a bag" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

@@ -137,7 +137,7 @@ def test_what_cannot_be_aligned(car, tmp_path, capsys):
     assert "--out: expected --car with it" in capsys.readouterr().err
     words = ["array", "align", str(car), str(car), "--car", str(car), "--detections", str(car)]
     assert main(words) == 2
-    assert "expected one recording with boxes" in capsys.readouterr().err
+    assert "expected one recording with --detections or --car" in capsys.readouterr().err
 
 
 def test_a_recording_without_a_camera_has_no_passes(tmp_path):

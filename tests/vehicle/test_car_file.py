@@ -168,7 +168,7 @@ def test_a_car_file_alone_carries_all_that_a_vehicle_has(tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--array", "mics.csv"], "--car: expected no --array with it"),
+        (["--array", "mics.csv"], "car: expected no array with it"),
         (["--camera", "lens.json"], "camera: expected one of front, left, got 'lens.json'"),
         (
             ["--detections", "a.json", "--detections", "b.json", "--uncalibrated"],
@@ -210,11 +210,11 @@ def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path
     [
         (
             ["--car", "CAR", "--camera", "left", "--detections", "front=a.json"],
-            "--detections: expected NAME=... of different cameras, without --camera",
+            "detections: expected those of several cameras without a camera",
         ),
         (
             ["--car", "CAR", "--detections", "left=a", "--detections", "left=b"],
-            "expected NAME=... of different cameras",
+            "--detections: expected different names, got left=a left=b",
         ),
         (
             ["--car", "CAR", "--detections", "rear=a.json"],

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from worldstate import adapters, simulation
-from worldstate.cli.common import listening, output, progress
+from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.extras import has_extra
 
 # Louder than a car, so that the first result of a newcomer is a clear case.
@@ -24,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--out", type=Path, default=Path("out/demo"), help="output folder (default: %(default)s)")
     add("--seed", type=int, default=1, help="number that determines the recording (default: 1)")
-    listening.add_budget_options(parser)
+    inputs.add_budget_options(parser)
 
 
 def simulate_approach(root: Path, seed: int) -> Path:
@@ -47,7 +47,7 @@ def simulate_approach(root: Path, seed: int) -> Path:
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command."""
+    """Run the command; return its result."""
     from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.adapters.state_log import read_log
     from worldstate.operations.recordings.recording_report import announcement
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     title = f"{folder.parent.parent.name}, vehicle from the {folder.parent.name}"
     figure = out / "timeline.png" if has_extra("matplotlib") else None
     with drawn_run(figure, source, title) as draw:
-        report = listening.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
+        report = progress.listen_with_progress(source, states_path=out / "states.jsonl", on_hop=draw)
     states = [state for _, state in read_log(out / "states.jsonl")]
     truth = read_true_tracks(folder)
     write_log_page(out / "log.html", page_data(states, title=title, t0_s=source.t0_s, truth=truth))

@@ -1,10 +1,10 @@
-"""`worldstate explain`: which evidence raised or holds an advisory.
+"""`worldstate explain`: list the evidence that raised or holds an advisory.
 
-Say of the snapshot nearest to a time what raised or holds the advisory of each side, or why there is none:
-what prior, sequence or window, looks and a vehicle that has just come into view add to the log-odds that
-the alarm goes by, then and when the advisory began; the entity; the sensors; whether the sound was foreign.
+Explain, for the snapshot nearest to a time, the advisory of each side or its absence: the terms of the
+log-odds of the alarm (prior, sequence or window, looks of the camera, a vehicle that has just come into
+view), now and when the advisory began; the entity; the sensors; whether the sound was foreign.
 
-Without --time all advisories are listed and the first one is explained, or the highest risk where there is
+Without --time the command lists all advisories and explains the first one, or the highest risk if there is
 none.
 
 Examples
@@ -27,13 +27,18 @@ from worldstate.ground.checks import one_of
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("states", type=Path, metavar="LOG", help="what `worldstate run` wrote by --out or --export mcap")
-    add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the first advisory)")
-    add("--side", help="of this side only, such as left (default: every side)")
+    add("states", type=Path, metavar="LOG", help="log of `worldstate run`, by --out or --export mcap")
+    add(
+        "--time",
+        type=float,
+        metavar="S",
+        help="seconds on the clock of the states (default: the first advisory)",
+    )
+    add("--side", help="one side only, such as left (default: every side)")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.state_log import read_log, read_state_near
     from worldstate.operations.recordings import evidence_report
 

@@ -1,23 +1,24 @@
-"""`worldstate hear`: many recordings in, tables of approaches out.
+"""`worldstate hear`: write tables of the approaches in many recordings.
 
-Hear every recording of a corpus and write its approaches as Parquet: time, side, lead, chance, and whether a
-vehicle was seen. A second run hears only what is missing, after a kill as well, and the tables are the same
-bytes for any number of processes or machines.
+Process every recording of a corpus and write its approaches as Parquet: time, side, lead, probability, and
+whether a vehicle was seen. A second run processes only missing recordings, also after a kill. The tables have
+the same bytes for any number of processes or machines.
 
 CORPUS is a folder of sound files, bags of ROS 2, recording folders in the OVAD layout and logs of snapshots
-(JSON lines, MCAP), or a manifest: CSV with the column path, relative to its own folder, and optionally site,
-detections (of the camera) and odometry. Below a folder the first folder of a path is its site.
+(JSON lines, MCAP), or a manifest: a CSV file with the column path, relative to its own folder, and optionally
+site, detections and odometry. Otherwise the first folder of a path below CORPUS is its site.
 
-DIR receives the folders recordings, approaches and hours, with one Parquet file a recording, named by its
-content, the array, the model, the options and the version. What cannot be heard is a row of recordings with
-its failure. Every file of a table can be read at once, as by pandas.read_parquet("DIR/approaches").
+DIR receives the folders recordings, approaches and hours with one Parquet file per recording. The name of a
+file follows from the content, the array, the model, the options and the version. A recording that cannot be
+read is a row of recordings with its failure. One call reads all files of a table, for example
+pandas.read_parquet("DIR/approaches").
 
---cascade hears four microphones first, and all of them only around seconds whose level or coherence exceeds
-the usual of the recording. One recording in twenty is heard whole, by which the recall is stated.
+--cascade uses four microphones first, and all of them only around seconds with unusual level or coherence.
+One recording in twenty is processed completely; this gives the recall.
 
---shadow counts every recording of DIR as free of hazards: hours heard and unheard, onsets an hour with their
-exact interval by site, day and state of the sensors, and how many more hours would show that the alarm keeps
-its budget.
+--shadow takes every recording of DIR as hazard-free and counts every advisory as false: hours with and
+without usable sound, onsets per hour with exact intervals by site, day and state of the sensors, and the
+further hours that would prove the budget.
 
 Examples
 --------
@@ -36,7 +37,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from worldstate.cli.common import inputs, listening, output, progress, sensors
+from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra
 
@@ -45,10 +46,6 @@ if TYPE_CHECKING:
 
 NEEDS = ("pyarrow",)
 _CONNECT_S = 10.0
-FIRST_OPTIONS = (
-    *("--out", "--array", "--model", "--budget", "--alpha", "--uncalibrated"),
-    *("--hops", "--cascade", "--shadow", "--jobs", "--scheduler", "--shard"),
-)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -57,35 +54,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("corpus", type=Path, metavar="CORPUS", help="folder of recordings, or a manifest (CSV)")
     add("--out", type=Path, required=True, metavar="DIR", help="folder of the tables")
     inputs.add_array_options(parser)
-    inputs.add_channel_option(parser)
-    sensors.add_car_option(parser)
-    sensors.add_lens_options(parser, parser.add_argument_group("camera"))
-    # The manifest names what each recording has of these.
-    parser.set_defaults(detections=[], images=None, image_rate=None, detector=None)
-    inputs.add_search_options(parser)
-    listening.add_listen_options(parser)
-    add("--mask-dead", action="store_true", help="leave silent channels out instead of failing")
-    add("--hops", action="store_true", help="write a row for each hop as well, its snapshot included")
-    quick = "hear only seconds that are louder or more coherent than usual; states its recall"
+    inputs.add_car_options(parser)
+    inputs.add_listen_options(parser)
+    add("--hops", action="store_true", help="write a row per hop as well, with its snapshot")
+    quick = "process only seconds that are louder or more coherent than usual; prints the recall"
     add("--cascade", action="store_true", help=quick)
-    told = "count every advisory as false: onsets an hour by site and state of the sensors, DIR/shadow.html"
+    told = "count every advisory as false: onsets per hour by site and sensor state, DIR/shadow.html"
     add("--shadow", action="store_true", help=told)
-    add("--shard", default="1/1", metavar="I/N", help="the I-th of N shares, as of a SLURM array (from 1)")
-    dask = "Dask: its workers hear in place of processes, and see the same files (extra dask)"
+    add("--shard", default="1/1", metavar="I/N", help="process share I of N, such as of a SLURM array")
+    dask = "Dask scheduler whose workers replace the processes; they need the same files (extra dask)"
     add("--scheduler", metavar="ADDRESS", help=dask)
-    add("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+    add("--jobs", type=int, default=1, metavar="N", help="number of processes (default: 1)")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.operations.corpus.corpus_inputs import find_corpus, share_of
     from worldstate.operations.corpus.corpus_run import hear
 
-    given, shard = sensors.given_sensors(arguments), _share(arguments.shard)
-    parts: dict[str, Any] = listening.place_and_settings(arguments, given.setup.boxes, arguments.mask_dead)
-    parts |= {"array": given.car.array, "model": given.model}
-    parts |= {"camera": given.camera, "miss_rates": given.miss_rates}
-    parts |= {"hops": arguments.hops, "cascade": arguments.cascade}
+    shard, (context, sides) = _share(arguments.shard), inputs.place_of(arguments.context)
+    taken = "array", "car", "camera", "model", "budget", "alpha", "uncalibrated", "hops", "cascade"
+    parts = {name: vars(arguments)[name] for name in taken} | {"context": context, "sides": sides}
     begun_s, count = time.perf_counter(), len(share_of(find_corpus(arguments.corpus), *shard))
     with _executor(arguments.scheduler) as executor, progress.progress_bar("hearing", count) as bar:
 
@@ -105,7 +94,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _recall(out: Path) -> str:
-    """Return the share of onsets that the cascade kept, of recordings that were heard whole as well."""
+    """Return the recall of the cascade in the recordings that were processed completely."""
     from worldstate.operations.corpus.corpus_tables import HeardApproach, corpus_rows
     from worldstate.operations.metrics.approach_table import share_interval
 
@@ -115,7 +104,7 @@ def _recall(out: Path) -> str:
 
 
 def _shadow(out: Path, found: dict[str, Any]) -> output.CommandResult:
-    """Return hours and onsets of the whole corpus, and write their page."""
+    """Write the page of hours and onsets of the whole corpus; return them."""
     from worldstate.operations.corpus import corpus_tables, shadow
 
     recordings = corpus_tables.corpus_rows(out, corpus_tables.HeardRecording)

@@ -1,31 +1,28 @@
-"""`worldstate live`: microphones that run in, one snapshot a hop out.
+"""`worldstate live`: compute the states from running microphones, one per hop.
 
-Listen to the microphones of this machine, or to a recording played as if they heard it, and keep the
-world-state; --help-all shows every option.
+Compute the world-state from the microphones of this machine, or from a recording that is played back.
 
-States are kept where asked for. The sound is not, unless --keep-sound says so: microphones in public hear
-people. What the machine was too slow for is counted as an overrun, said when it happens, and heard as
-silence. Ctrl-C ends the run, and what it wrote is complete. Snapshots, MCAP and sound grow under their own
-name, and read at any time: a killed run loses half a second. What was there before becomes NAME.N.SUFFIX, the
-first number that is free; two runs cannot write one file. A log that cannot be written, or was removed, does
-not end the run: a notice on standard error names it.
+The sound is not stored without --keep-sound, because microphones in public record people. If the machine is
+too slow, the lost sound is an overrun and is replaced by silence. Ctrl-C ends the run with complete files.
+Logs and sound can be read while they grow; after a kill half a second is missing. An earlier file of the same
+name becomes NAME.N.SUFFIX. If a log cannot be written, a notice on standard error follows and the run
+continues.
 
---detections HOST:PORT takes what a detector of your own reports, a UDP datagram an image:
+--detections HOST:PORT receives the detections of your own detector, one UDP datagram per image:
   {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}
-with "age_s" from the capture of the image to the sending; an image without boxes is sent, too. Several
-cameras of --car have an address each: NAME=HOST:PORT, repeated.
+"age_s" is the time from the capture of the image to the sending. Send images without boxes as well. For
+several cameras of --car, repeat NAME=HOST:PORT.
 
---odometry HOST:PORT takes how the car moves in the same way, as often as it is known:
+--odometry HOST:PORT receives the motion of the vehicle in the same way:
   {"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}
-with "x_m", "y_m" and "yaw_rad" in a map where a localiser tells them. With it, or with the odometry of --car,
-the model of a moving ego is taken where --model names none.
+optionally with "x_m", "y_m" and "yaw_rad" in a map. It selects the model for a moving ego vehicle.
 
-A port takes its first sender until that one is silent for ten seconds, or all of --allow. With --key, the
-file of a secret, a datagram ends in a line with its HMAC-SHA256, and has a "number" that rises, the "port"
+A port accepts one sender until that sender is silent for ten seconds, or all hosts of --allow. With --key,
+the file of a secret, a datagram ends in a line with its HMAC-SHA256 and has a rising "number", the "port"
 that it is for (odometry, detections or detections/NAME) and "sent_s", the Unix time of sending.
 
---save-state keeps belief, site and the numbers taken last every minute and at the end, --resume goes on from
-them: from the time at which they end, or by --start from a later one.
+--save-state writes belief, site and the last numbers every minute and at the end. --resume continues from
+them, at their time or at --start.
 
 Examples
 --------
@@ -48,130 +45,130 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from worldstate import adapters, ground
-from worldstate.cli.common import command, exports, inputs, listening, output, progress, sensors
+from worldstate.cli.common import command, exports, inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.extras import check_extra
 
 if TYPE_CHECKING:
     from worldstate.adapters.listener import Listener
     from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.adapters.live.live_sensors import DatagramSocket, Trust
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
+    from worldstate.adapters.source import SourceSensors
 
     HandIn = Callable[[Listener], int]
     Losses = Callable[[], dict[str, object]]
 
 Port = TypeVar("Port", bound="DatagramSocket[Any]")
 
-
-# Lost sound is said at most so often.
+# Shortest time between two notices of lost sound.
 SAID_EVERY_NS = 1_000_000_000
-# What a killed run has learned of the site and the belief since is lost.
+# A killed run loses what it has learned since the last save.
 SAVED_EVERY_NS = 60_000_000_000
-# Bytes of a secret: fewer are guessed.
+# Shorter secrets, in bytes, can be guessed.
 SHORTEST_KEY = 16
 WEB_PORT = 8766
-# What a first user needs.
-FIRST_OPTIONS = (
-    *("--array", "--car", "--model", "--budget", "--alpha", "--uncalibrated", "--context", "--street"),
-    *("--device", "--play", "--camera-device", "--detections", "--camera", "--odometry"),
-    *("--out", "--export", "--web"),
-)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     inputs.add_array_options(parser)
-    inputs.add_channel_option(parser)
-    sensors.add_car_option(parser)
+    inputs.add_car_options(parser)
     add = parser.add_argument_group("sound").add_argument
     add("--device", metavar="NAME", help="number or name of the input device (default: the system's)")
-    add("--rate", type=int, default=48_000, metavar="HZ", help="samples a second (default: %(default)s)")
-    add("--play", type=Path, metavar="RECORDING", help="a sound file or recording folder instead")
-    add("--speed", type=float, default=1.0, metavar="X", help="play so many times as fast (default: 1)")
-    ends = "end after so many seconds of sound; a shorter recording is played again"
+    add("--rate", type=int, default=48_000, metavar="HZ", help="samples per second (default: %(default)s)")
+    add("--play", type=Path, metavar="RECORDING", help="sound file or recording folder to play instead")
+    add("--speed", type=float, default=1.0, metavar="X", help="factor of the playback speed (default: 1)")
+    ends = "end after this length of sound, seconds; a shorter recording is repeated"
     add("--duration", type=float, metavar="S", help=ends)
-    inputs.add_search_options(parser)
-    listening.add_listen_options(parser)
-    listening.add_memory_options(parser, "the end of STATE")
-    told = "listen there to how the car moves"
-    parser.add_argument("--odometry", metavar="HOST:PORT", help=told)
+    inputs.add_listen_options(parser)
+    inputs.add_memory_options(parser, "the end of STATE")
+    parser.add_argument("--odometry", metavar="HOST:PORT", help="receive the motion of the vehicle there")
     add = parser.add_argument_group("ports").add_argument
-    told = "take datagrams of this address only; repeated (default: the first sender)"
-    add("--allow", action="append", default=[], metavar="HOST", help=told)
-    add("--key", type=Path, metavar="FILE", help="take datagrams only that prove to know this secret")
-    group = parser.add_argument_group("camera")
-    which = group.add_mutually_exclusive_group()
+    text = "accept datagrams of this host only; may be repeated (default: the first sender)"
+    add("--allow", action="append", default=[], metavar="HOST", help=text)
+    add("--key", type=Path, metavar="FILE", help="accept only datagrams that are signed with this secret")
+    which = parser.add_argument_group("camera").add_mutually_exclusive_group()
     which.add_argument("--camera-device", type=int, metavar="N", help="number of a camera of this machine")
-    told = "listen there to a detector of your own; NAME=HOST:PORT of a camera of --car, repeated"
-    which.add_argument("--detections", action="append", default=[], metavar="HOST:PORT", help=told)
-    sensors.add_lens_options(parser, group)
-    sensors.add_detector_option(parser)
+    text = "receive the detections of your own detector there; NAME=HOST:PORT for a camera of --car"
+    which.add_argument("--detections", action="append", default=[], metavar="HOST:PORT", help=text)
+    inputs.add_detector_option(parser)
     parser.set_defaults(detector=None)
     add = exports.add_output_options(parser).add_argument
-    add("--keep-sound", type=Path, metavar="WAV", help="keep the raw sound, too (RF64, 24 bits)")
-    told = "begin a new JSONL and MCAP at so many MiB, and keep the one before as NAME.N.SUFFIX"
-    add("--rotate-mib", type=int, metavar="N", help=told)
-    view = "show bearing, risk and entities (default: where standard error is a terminal)"
-    told = "serve a page that shows the run on this machine, http://127.0.0.1:PORT (default: %(const)s)"
-    add("--web", type=int, nargs="?", const=WEB_PORT, metavar="PORT", help=told)
+    add("--keep-sound", type=Path, metavar="WAV", help="store the raw sound (RF64, 24 bits)")
+    text = "begin new logs at this size, and keep the earlier ones as NAME.N.SUFFIX"
+    add("--rotate-mib", type=int, metavar="N", help=text)
+    view = "show bearing, risk and entities (default: if standard error is a terminal)"
+    text = "show the run in a browser of this machine, http://127.0.0.1:PORT (default: %(const)s)"
+    add("--web", type=int, nargs="?", const=WEB_PORT, metavar="PORT", help=text)
     add("--view", action=argparse.BooleanOptionalAction, default=None, help=view)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
+    from worldstate.adapters.listener import PUSHED
     from worldstate.adapters.live.live_listening import live_steps
     from worldstate.adapters.live.live_sound import LiveSound, kept_sound
+    from worldstate.adapters.source import SourceSensors
 
     output.check_outputs(arguments, "out", "keep_sound", "save_state")
     command.check_beside(arguments, detector="camera_device")
     arguments.detector = arguments.detector or "motion"
-    given = listening.checked_sensors(arguments, [] if arguments.play is None else [arguments.play])
+    check_extra(*exports.needed_extras(arguments))
+    sensors = SourceSensors.of(arguments.array, arguments.car, arguments.camera)
+    if arguments.play is None and sensors.car.array is None:
+        problem = "expected the positions of the microphones, or --car, or --play RECORDING"
+        raise InvalidArgumentError(f"--array: {problem}")
     with ExitStack() as opened:
-        recorded = None if arguments.play is None else _source(arguments, given, arguments.play)
-        feed = _microphones(arguments, given) if recorded is None else _played(arguments, recorded)
+        # A model for another array is refused before a device is opened.
+        source = _source(arguments, sensors, arguments.play or Path(PUSHED))
+        feed = _microphones(arguments, source) if arguments.play is None else _played(arguments, source)
         keep = opened.enter_context(kept_sound(arguments.keep_sound, feed.sample_rate_hz, feed.channels))
         sound = LiveSound(feed, keep)
-        source = _source(arguments, given, sound) if recorded is None else replace(recorded, sound=sound)
+        source = replace(source, sound=sound)
         sound.start_ns = source.start_ns
         ports = _Ports(_trust(arguments, source.before), sound, opened)
-        source, look, looks_lost = _with_cameras(given, source, ports)
+        source, look, looks_lost = _with_cameras(arguments, sensors, source, ports)
         tell, odometry_lost = _odometry(arguments, ports)
         steps = live_steps(source, look, tell)
-        figures = _listen(arguments, given, source, ports, steps) | looks_lost() | odometry_lost()
+        figures = _listen(arguments, source, ports, steps) | looks_lost() | odometry_lost()
         return output.CommandResult(figures | {"array": inputs.stance(source.array)})
 
 
-def _source(
-    arguments: argparse.Namespace, given: sensors.GivenSensors, sound: "LiveSound | Path"
-) -> "adapters.Source":
+def _source(arguments: argparse.Namespace, sensors: "SourceSensors", sound: Path) -> "adapters.Source":
     from worldstate.adapters.files.odometry_file import read_odometry
 
     before = None if arguments.resume is None else adapters.read_checkpoint(arguments.resume)
-    # Of a running car the file tells that it moves, and where it was only of a recording that is played.
-    path = None if arguments.odometry is not None else given.car.odometry
+    # The odometry file of a running car only shows that it moves; the motion applies to a played recording.
+    car, (context, sides) = sensors.car, inputs.place_of(arguments.context)
+    path = None if arguments.odometry is not None else car.odometry
     drive = None if path is None else read_odometry(path)
     ended_s = 0.0 if before is None else ground.seconds(before.world.stamp_ns)
-    return listening.open_given(
-        given,
+    detector = None if arguments.camera_device is None else arguments.detector
+    source = adapters.open_source(
         sound,
-        boxes=given.setup.boxes if arguments.camera_device is None else given.boxes(),
-        mask_dead=True,  # a channel that is silent is told by the front-end, which leaves it out
-        array=given.car.array,
-        ego=drive if arguments.play is not None else None,
+        car.array,
+        camera=sensors.camera,
+        miss_rates=sensors.setup.miss_rates,
+        model=arguments.model or car.model,
+        context=context,
+        sides=sides,
+        odometry=drive if arguments.play is not None else None,
         moving_ego=arguments.odometry is not None or (drive is not None and drive.moves),
         resume=before,
         start_s=ended_s if arguments.start is None else arguments.start,
+        budget=arguments.budget,
+        alpha=arguments.alpha,
+        uncalibrated=arguments.uncalibrated,
+        settings=sensors.boxes_in(adapters.ListenSettings(), detector),
     )
+    return replace(source, crossing_m=car.crossing_m)
 
 
-def _microphones(arguments: argparse.Namespace, given: sensors.GivenSensors) -> "SoundFeed":
+def _microphones(arguments: argparse.Namespace, source: "adapters.Source") -> "SoundFeed":
     from worldstate.adapters.live.live_sound import PortAudioInput
 
-    array = given.car.array
-    if array is None:
-        problem = "expected the positions of the microphones, or --car, or --play RECORDING"
-        raise InvalidArgumentError(f"--array: {problem}")
-    device = arguments.device
+    array, device = source.array, arguments.device
     number = int(device) if device is not None and device.isdecimal() else device
     rate_hz = int(ground.in_range("--rate", arguments.rate, 1000, 1_000_000))
     return PortAudioInput(max(array.channels, default=array.n_microphones), rate_hz, number)
@@ -181,13 +178,13 @@ def _played(arguments: argparse.Namespace, recorded: "adapters.Source") -> "Soun
     from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.adapters.live.live_sound import Playback
 
-    audio = open_sound(recorded.sound, strict=False)  # with the channels of the card, as microphones give it
+    audio = open_sound(recorded.sound, strict=False)  # With all channels of the sound card
     return Playback(audio, arguments.speed, arguments.duration)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Ports:
-    """Ports that listen beside the microphones, until `opened` ends."""
+    """Open ports of detectors and odometry; `opened` closes them."""
 
     trust: "Trust"
     sound: "LiveSound"
@@ -195,14 +192,14 @@ class _Ports:
     sockets: "list[DatagramSocket[Any]]" = field(default_factory=list)
 
     def open(self, kind: "Callable[..., Port]", address: str, *camera: str) -> "Port":
-        """Open a port, of one of several cameras that of its name."""
+        """Open a port, for one of several cameras with its name."""
         port = kind(address, self.sound.stamp_ns, self.trust, *camera)
         self.opened.enter_context(port)
         self.sockets.append(port)
         return port
 
     def kept(self, last: "adapters.Step") -> "adapters.Checkpoint":
-        """Return what to go on from, with the numbers that were taken last."""
+        """Return the checkpoint of a hop, with the last number of each port."""
         from worldstate.adapters.files.checkpoint_file import PortNumbers
 
         numbers = dict(self.trust.numbers)
@@ -212,42 +209,43 @@ class _Ports:
 
 
 def _with_cameras(
-    given: sensors.GivenSensors, source: "adapters.Source", ports: _Ports
+    arguments: argparse.Namespace, sensors: "SourceSensors", source: "adapters.Source", ports: _Ports
 ) -> "tuple[adapters.Source, HandIn, Losses]":
-    """Return the source with the cameras that were asked for, what hands their looks in, and their losses."""
+    """Return the source with its cameras, a function that passes their detections on, and their losses."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS, SENSOR
     from worldstate.adapters.live.live_sensors import DetectionSocket
-    from worldstate.operations.recordings.car_cameras import with_cameras
+    from worldstate.adapters.source import with_cameras
 
-    if given.arguments.camera_device is not None:
-        return _with_device(given, source, ports.sound, ports.opened)
-    named = given.named()
-    sockets = {name: ports.open(DetectionSocket, address, name) for name, address in named.items()}
-    for address in () if named else given.arguments.detections:
-        sockets[SENSOR] = ports.open(DetectionSocket, address)
-    if named:
-        source = with_cameras(source, given.car, dict.fromkeys(named, NO_LOOKS))
-    elif sockets:
-        source = replace(source, detections=NO_LOOKS)
+    if arguments.camera_device is not None:
+        return _with_device(arguments, sensors, source, ports)
+    given = inputs.reported(arguments)
+    if isinstance(given, dict):
+        if sensors.chosen:
+            raise InvalidArgumentError("--detections: expected those of several cameras without --camera")
+        sockets = {name: ports.open(DetectionSocket, address, name) for name, address in given.items()}
+        source = with_cameras(source, sensors.car, dict.fromkeys(given, NO_LOOKS))
+    else:
+        sockets = {} if given is None else {SENSOR: ports.open(DetectionSocket, given)}
+        source = replace(source, detections=NO_LOOKS) if sockets else source
 
     def hand_in(listener: "Listener") -> int:
-        return sum(told.deliver(partial(listener.look, camera=name)) for name, told in sockets.items())
+        return sum(one.deliver(partial(listener.look, camera=name)) for name, one in sockets.items())
 
     return source, hand_in, _losses(sockets.values(), "detections")
 
 
 def _with_device(
-    given: sensors.GivenSensors, source: "adapters.Source", sound: "LiveSound", opened: ExitStack
+    arguments: argparse.Namespace, sensors: "SourceSensors", source: "adapters.Source", ports: _Ports
 ) -> "tuple[adapters.Source, HandIn, Losses]":
     """Return the source with a camera of this machine."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS
     from worldstate.adapters.live.live_sensors import CameraFeed, ImageLooks, image_channel
+    from worldstate.adapters.own_parts import detector_maker
 
-    arguments, images = given.arguments, image_channel()
-    detector = sensors.detector_maker(arguments.detector, given.setup.labels)()
+    images, detector = image_channel(), detector_maker(arguments.detector, sensors.setup.labels)()
     size = source.camera.width_px, source.camera.height_px
-    looks = ImageLooks(images, detector, sound.stamp_ns, size, source.miss_rates)
-    opened.enter_context(CameraFeed(arguments.camera_device, images))
+    looks = ImageLooks(images, detector, ports.sound.stamp_ns, size, source.miss_rates)
+    ports.opened.enter_context(CameraFeed(arguments.camera_device, images))
     seen = replace(source, detections=NO_LOOKS, degradation=looks.degradation)
 
     def losses() -> dict[str, object]:
@@ -258,7 +256,7 @@ def _with_device(
 
 
 def _odometry(arguments: argparse.Namespace, ports: _Ports) -> "tuple[HandIn, Losses]":
-    """Return what hands the odometry in that was asked for, and its losses."""
+    """Return a function that passes the odometry on, and its losses."""
     from worldstate.adapters.live.live_sensors import OdometrySocket
 
     if arguments.odometry is None:
@@ -298,12 +296,11 @@ def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") 
 
 def _listen(
     arguments: argparse.Namespace,
-    given: sensors.GivenSensors,
     source: "adapters.Source",
     ports: _Ports,
     steps: "Iterator[LiveStep]",
 ) -> dict[str, object]:
-    """Listen until the sound ends; return what came of it and what it cost."""
+    """Listen until the sound ends; return the figures of the run."""
     from worldstate.adapters.files.file_io import GrowingFile, line_writer
     from worldstate.adapters.live.live_listening import CostMeter, LatencyMeter
     from worldstate.operations.recordings.recording_report import WarningMeter
@@ -315,7 +312,7 @@ def _listen(
     with (
         _kept(arguments, ports) as keep,
         line_writer(arguments.out, partial(GrowingFile, most_bytes=exports.most_bytes(arguments))) as write,
-        exports.exported_hops(arguments, source, given.car.crossing_m, live=True) as export,
+        exports.exported_hops(arguments, source, live=True) as export,
         _view(arguments) as show,
         _web(arguments) as show_page,
         command.stopped_by_signals(sound.close),
@@ -348,7 +345,7 @@ def _listen(
 
 @contextmanager
 def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[adapters.Step], None]]":
-    """Lend a function that saves --save-state once a minute, and save it at the end, whatever ends it."""
+    """Yield a function that writes --save-state once per minute, and write it at the end."""
     path, last, saved_ns = arguments.save_state, None, None
 
     def save() -> None:
@@ -363,13 +360,13 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
             saved_ns = stamp_ns
             try:
                 save()
-            except (ground.WorldstateError, OSError) as error:  # the next minute may have room
+            except (ground.WorldstateError, OSError) as error:  # There may be room in a minute
                 output.say(str(error))
 
     try:
         yield keep
     except BaseException:
-        with suppress(ground.WorldstateError, OSError):  # what ended the run is told
+        with suppress(ground.WorldstateError, OSError):  # The first error is reported
             save()
         raise
     save()
@@ -377,7 +374,7 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
-    """Lend a function that shows a hop where --view or a terminal asks for it."""
+    """Yield a function that shows a hop in the terminal, if --view or a terminal is given."""
     if not (progress.can_draw() if arguments.view is None else arguments.view):
         yield lambda live: None
         return
@@ -389,7 +386,7 @@ def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]
 
 @contextmanager
 def _web(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
-    """Lend a function that passes a hop on to the page of --web."""
+    """Yield a function that passes a hop on to the page of --web."""
     if arguments.web is None:
         yield lambda live: None
         return
@@ -401,7 +398,7 @@ def _web(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]
 
 
 def _loss_notices() -> "Callable[[LiveStep], None]":
-    """Return a function that says on standard error when sound was lost, at most once a second."""
+    """Return a function that prints a notice of lost sound, at most once per second."""
     said, said_ns = 0, -SAID_EVERY_NS
 
     def notice(live: "LiveStep") -> None:

@@ -1,10 +1,10 @@
-"""Keep a structured world-state alive from sound when vision fails.
+"""Keep a structured world-state from sound when vision fails.
 
 example: worldstate demo --out out/demo
 
 exit codes: 0 done, 1 `array check` found a fault, 2 bad input (one line on
-standard error says what came and what was expected), 130 after Ctrl-C, 143
-after SIGTERM; unfinished files are removed, but for the logs of `live`
+standard error states what was given and what was expected), 130 after Ctrl-C,
+143 after SIGTERM; unfinished files are removed, except the logs of `live`
 """
 
 import json
@@ -15,8 +15,8 @@ from importlib.resources import files
 from worldstate.cli.common.command import Program, run_program
 from worldstate.ground.errors import InvalidArgumentError
 
-# A group is a folder, a command is a module in it, with `add_options` and `run` and a docstring that ends in
-# examples; each keeps its heavy imports inside `run`.
+# A group is a folder, and a command is a module in it with `add_options`, `run` and a docstring that ends in
+# examples. Slow imports are inside `run`.
 COMMANDS = (
     *("demo", "run", "live", "hear", "explain"),
     *("array check", "array bounds", "array bearings", "array align", "array list"),
@@ -28,14 +28,14 @@ COMMANDS = (
     "completion",
 )
 GROUPS = {
-    "array": "an array of microphones: its health, what it allows, where it points",
-    "model": "a model for an array: made, fitted, set to a budget, shown",
-    "street": "a street: learned from the vehicles that pass, labelled",
-    "log": "the snapshots of a run: drawn, viewed, replayed, upgraded",
+    "array": "check a microphone array, its limits and its bearings",
+    "model": "make, fit, calibrate and show models for an array",
+    "street": "learn and label a street from passing vehicles",
+    "log": "draw, view, replay and upgrade the snapshots of a run",
     "sim": "simulated streets",
 }
-# Former names of commands and options, read through the next minor version, and what stands in their place;
-# studies are commands of `worldstate-lab`, which the wheel of the library does not hold.
+# Former names of commands and options, with their successors, until the next minor version. Studies are
+# commands of `worldstate-lab`, a distribution of its own.
 _NAMES = (files("worldstate") / "data" / "former_names.json").read_text("utf-8")
 FORMER, STUDIES, FORMER_OPTIONS = json.loads(_NAMES).values()
 DESCRIPTION, _, EPILOG = (__doc__ or "").strip().partition("\n\n")
@@ -45,7 +45,7 @@ PROGRAM = Program("worldstate", DESCRIPTION, EPILOG, _MODULES, GROUPS, ("complet
 
 
 def current_words(words: Sequence[str]) -> list[str]:
-    """Return the words of a call with the former name of a command replaced; a study is refused."""
+    """Return the words of a call with a former command replaced by its successor; refuse a study."""
     first, *rest = words or [""]
     if first in STUDIES:
         successor = f"`worldstate-lab {STUDIES[first]}`, of the distribution worldstate-lab"
@@ -53,10 +53,8 @@ def current_words(words: Sequence[str]) -> list[str]:
     if first in FORMER:
         print(f"worldstate: `{first}` is now `{FORMER[first]}`", file=sys.stderr)
         return [*FORMER[first].split(), *rest]
-    # `model FILE` shows a card, as it did before there were groups; `model` that of the model that ships.
-    if first == "model" and not {*rest[:1]} & {*PROGRAM.members("model"), "-h", "--help"}:
-        return ["model", "show", *rest]
-    return list(words)
+    # `worldstate help run` is `worldstate run --help`.
+    return [*rest, "--help"] if first == "help" else list(words)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -24,6 +24,7 @@ EXTRAS = {
     "rerun": ("rerun-sdk", "rerun"),
     "rich": ("rich", "cli"),
     "rosbags": ("rosbags", "ros"),
+    "shtab": ("shtab", "cli"),
     "sklearn": ("scikit-learn", "train"),
     "sounddevice": ("sounddevice", "live"),
     "websockets": ("websockets", "web"),

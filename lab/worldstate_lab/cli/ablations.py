@@ -25,9 +25,8 @@ from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.adapters.camera.miss_rates import load_miss_rates
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.listening import read_streams
 from worldstate.cli.common.output import CommandResult
-from worldstate.cli.common.progress import track
+from worldstate.cli.common.progress import read_streams, track
 from worldstate_lab.evaluation.ablation_rows import AblationSwitches, ablation_table
 from worldstate_lab.report.table import figure_lines
 from worldstate_lab.sequences.camera_rows import corner_rows

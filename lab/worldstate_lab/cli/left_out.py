@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
     settings, array = _settings(arguments), frontend.ovad_array()
     if arguments.array is not None:
-        array = adapters.read_array(arguments.array, arguments.array_axes)
+        array = adapters.read_array(arguments.array)
     plan, streams = learned_streams(settings), list[HeardStream]()
     if not any(one.traffic.hazard_free and not one.traffic.name.startswith(MISLEADING) for one in plan):
         raise InvalidArgumentError("--junctions: expected 3 or more to set the threshold")

@@ -45,9 +45,9 @@ from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_array
 from worldstate.adapters.files.array_match import microphone_order
 from worldstate.adapters.files.model_file import read_model
+from worldstate.adapters.own_parts import detector_maker, detector_name
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar, track
-from worldstate.cli.common.sensors import detector_maker, detector_name
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.simulation.dataset.dataset import write_dataset

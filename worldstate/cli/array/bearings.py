@@ -1,12 +1,11 @@
-"""`worldstate array bearings`: the direction of the loudest source at every hop, without a model.
+"""`worldstate array bearings`: write the bearing of the loudest source at every hop.
 
-Write the bearing of the loudest source every tenth of a second, for any array, without a model.
+Write the bearing of the loudest source every 0.1 s, for any array and without a model.
 
---out is CSV with the columns time_s (middle of the sound that the bearing was read from), azimuth_deg (left
-positive), std_deg (standard deviation as the front-end states it), prominence (peak over median of the
-spatial spectrum; 1 in silence) and at_edge (1 at the edge of the sector that is searched, where the source
-may lie beyond it). --sources adds the number of plane waves in each second by an information criterion:
-reflections count, so it is no number of vehicles.
+--out is a CSV file with the columns time_s (middle of the window), azimuth_deg (left positive), std_deg
+(estimated standard deviation), prominence (peak over median of the spatial spectrum; 1 in silence) and
+at_edge (1 at the edge of the searched sector, beyond which the source may be). --sources adds the number of
+plane waves per second by an information criterion; it includes reflections and is not the number of vehicles.
 
 Examples
 --------
@@ -19,7 +18,7 @@ from pathlib import Path
 
 from worldstate.cli.common import inputs, output, progress
 
-_MUCH_AT_EDGE = 0.1  # Share of the hops: what lies behind is found at the edge
+_MUCH_AT_EDGE = 0.1  # Share of the hops: a source beyond the sector appears at its edge
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,13 +26,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_sound_options(parser)
     inputs.add_array_options(parser)
     inputs.add_search_options(parser)
-    parser.add_argument("--sources", action="store_true", help="count the sources of every second")
-    parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
+    parser.add_argument(
+        "--sources", action="store_true", help="estimate the number of plane waves per second"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="file to write")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw azimuth over time")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.files.file_io import write_text
     from worldstate.operations.recordings import bearing_track
 
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if arguments.figure is not None:
         bearing_track.write_bearings_figure(track, arguments.figure, audio.path.name)
     if (at_edge := float(track.at_edge.mean())) > _MUCH_AT_EDGE and arguments.azimuth_span is not None:
-        told = f"{100 * at_edge:.0f} % of the bearings lie at the edge of what is searched"
+        told = f"{100 * at_edge:.0f} % of the bearings are at the edge of the searched sector"
         output.say(f"{told}: without --azimuth-span the array chooses the sector")
     summary = {
         "out": str(arguments.out),

@@ -1,8 +1,8 @@
-"""`worldstate array bounds`: what an array allows.
+"""`worldstate array bounds`: print the limits of an array.
 
-Print the second moment S_xx, aperture and alias frequency of an array, and the Cramer-Rao bound of a bearing
-at several azimuths: the standard deviation that no unbiased estimator can beat. The SNR is per microphone and
-snapshot, N snapshots independent.
+Print the second moment S_xx, the aperture and the alias frequency of an array, and the Cramer-Rao bound of a
+bearing at several azimuths: the least standard deviation of an unbiased estimator. The SNR is per microphone
+and snapshot, for N independent snapshots.
 
 Examples
 --------
@@ -16,7 +16,7 @@ from worldstate import frontend, ground, operations
 from worldstate.cli.common import inputs, output
 
 AZIMUTHS_DEG = (0.0, 20.0, 40.0, 60.0, 80.0)
-# From below the threshold SNR, where estimators fail, to well above it.
+# From below the threshold SNR, at which estimators fail, to well above it.
 SNR_DB = (-15.0, -10.0, -5.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
 
 
@@ -24,13 +24,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     inputs.add_array_options(parser, "the 56-microphone roof array")
     add = parser.add_argument
-    add("--frequency", type=float, default=1000.0, metavar="HZ", help="of the source (default: %(default)g)")
-    add("--snr-db", type=float, nargs="+", default=list(SNR_DB), metavar="DB", help="(default: -15 to 30)")
-    add("--snapshots", type=int, default=20, metavar="N", help="(default: %(default)s)")
+    add(
+        "--frequency",
+        type=float,
+        default=1000.0,
+        metavar="HZ",
+        help="frequency of the source (default: %(default)g)",
+    )
+    add(
+        "--snr-db",
+        type=float,
+        nargs="+",
+        default=list(SNR_DB),
+        metavar="DB",
+        help="signal-to-noise ratios (default: -15 to 30)",
+    )
+    add("--snapshots", type=int, default=20, metavar="N", help="independent snapshots (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     ground.in_range("--frequency", arguments.frequency, 0.0, 1e6, open_low=True)
     ground.in_range("--snapshots", arguments.snapshots, 1, 1e6)
     for level in arguments.snr_db:
@@ -44,7 +57,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 def _as_table(
     bounds: "operations.ArrayBounds", array: "frontend.MicrophoneArray", arguments: argparse.Namespace
 ) -> dict[str, object]:
-    """One line a quantity, and one an azimuth, for people."""
+    """Return a readable table with one line per quantity and per azimuth."""
     N, levels = arguments.snapshots, arguments.snr_db
     table: dict[str, object] = {
         "array": inputs.stance(array),

@@ -1,21 +1,21 @@
-"""`worldstate array check`: which microphones of a recording misbehave, and what to do about it.
+"""`worldstate array check`: find faulty microphones in a recording, with the way to correct them.
 
-Listen to a recording and say what is wrong with its microphones: dead, intermittent, noisy, swapped, inverted
-or clipped ones, offsets, levels, gusts, cards that are late or have a clock of their own, missing or repeated
-samples, the sample rate. Channels are counted from 1. It also compares the sound with the positions: channels
-exchanged or in another order, an array of another size.
+Check the microphones of a recording: dead, intermittent, noisy, exchanged, inverted or clipped channels,
+offsets, levels, wind, sound cards with a delay or a clock of their own, missing or repeated samples, and the
+sample rate. Channels are counted from 1. The sound is also compared with the positions: exchanged channels,
+another order, an array of another size.
 
-No sound tells whether an array is mirrored or turned: --heard-from DEG says where one sound came from, in
-degrees, left positive.
+Sound alone cannot show that an array is mirrored or turned: give the true azimuth of one sound with
+--heard-from DEG, in degrees, left positive.
 
---fit offers positions that explain the sound better than those of --array, whatever their order and size, up
-to a turn and a mirror image: it prints them as CSV, and states by how much, on quarters of a second that were
-not fitted. --fit FILE writes them, as XML or CSV by its name. What the sound does not show is named and stays
-as given. Sound from many sides is needed, that of one is refused: --also names further recordings.
+--fit estimates positions that explain the sound better than those of --array, in any order and of any size,
+up to a rotation and a mirror image. It prints them as CSV with the improvement on quarters of a second that
+were not fitted. --fit FILE writes them as XML or CSV. Positions that the sound does not determine stay
+unchanged, and the output lists them. The fit needs sound from many sides; --also adds recordings.
 
-Exit code 0 where nothing is wrong, 1 where something is, 2 for bad input. Swapped, inverted, noisy
-and late microphones show only in sound that all of them hear: two seconds of traffic do for large arrays,
-ten for small ones; levels and gusts take six seconds, drifts twenty.
+Exit code 0 without a fault, 1 with a fault, 2 for bad input. Exchanged, inverted, noisy and delayed
+microphones show only in sound that reaches all of them: two seconds of traffic are enough for large arrays,
+ten for small ones. Levels and wind take six seconds, drifts twenty.
 
 Examples
 --------
@@ -44,12 +44,11 @@ if TYPE_CHECKING:
     from worldstate.frontend.health.position_check import PositionCheck
     from worldstate.operations.recordings.channel_report import RecordingHealth
 
-# Least extent in shortest waves; what metres are divided by where they are taken for another unit; extents of
-# arrays that are built, metres.
+# Least extent in shortest wavelengths; units that are taken for metres; extents of usual arrays, m.
 _LEAST_WAVE = 0.1
 _UNITS = {"inches": 39.37, "millimetres": 1000.0}
 _USUAL_M = (0.03, 1.5)
-_PRINTED = Path()  # Positions are printed alone
+_PRINTED = Path()  # --fit without a file prints the positions
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -58,17 +57,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_array_options(parser)
     inputs.add_search_options(parser)
     add = parser.add_argument
-    add("--duration", type=float, metavar="S", help="its length by another clock, seconds")
-    add("--duration-error", type=float, default=0.01, metavar="S", help="of that (default: %(default)s s)")
+    add("--duration", type=float, metavar="S", help="length of the recording by another clock, seconds")
+    add(
+        "--duration-error",
+        type=float,
+        default=0.01,
+        metavar="S",
+        help="error of this length (default: %(default)s s)",
+    )
     add("--heard-from", type=float, metavar="DEG", help="azimuth of the only source, left positive")
-    told = "offer positions that explain the sound better, and write them (.csv or .xml)"
+    told = "estimate positions from the sound, and write them (.csv or .xml)"
     add("--fit", type=Path, nargs="?", const=_PRINTED, metavar="FILE", help=told)
     add("--also", type=Path, nargs="+", default=[], metavar="SOUND", help="for --fit: further recordings")
     add("--figure", type=Path, metavar="PNG", help="draw the array with its faults")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.files.array_file import array_csv, write_array_xml
     from worldstate.adapters.files.file_io import write_text
     from worldstate.frontend.health.fitted_positions import fit_positions
@@ -78,7 +83,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if arguments.fit not in (None, _PRINTED) and arguments.fit.suffix not in (".csv", ".xml"):
         raise InvalidArgumentError(f"--fit: expected a name that ends in .csv or .xml, got {arguments.fit}")
     if arguments.also and arguments.fit is None:
-        raise InvalidArgumentError("--also: expected --fit, which alone hears further recordings")
+        raise InvalidArgumentError("--also: expected --fit with it")
     if arguments.heard_from is not None:
         in_range("--heard-from", arguments.heard_from, -360.0, 360.0)
     with inputs.opened_front_end(arguments) as (audio, front_end):
@@ -112,7 +117,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def check_extent(array: "frontend.MicrophoneArray", highest_hz: float) -> None:
-    """Refuse an array that the shortest waves hardly notice, and name the unit that its numbers had."""
+    """Refuse an array much smaller than the shortest wave, and suggest the unit of its numbers."""
     from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
 
     extent_m, least_m = array.widest_m, _LEAST_WAVE * SPEED_OF_SOUND_M_S / highest_hz
@@ -126,7 +131,7 @@ def check_extent(array: "frontend.MicrophoneArray", highest_hz: float) -> None:
 def examine(
     audio: "Audio", front_end: "frontend.FrontEnd", heard_from_deg: float | None = None
 ) -> "tuple[RecordingHealth, PositionCheck]":
-    """Listen to an open recording to its end; return what was found, and the check of positions."""
+    """Process an open recording; return the health of its channels, and the check of positions."""
     from worldstate.frontend.health.position_check import PositionCheck
     from worldstate.operations.recordings.channel_report import HealthLog
 

@@ -1,7 +1,7 @@
-"""`worldstate array list`: the arrays that --array takes by name.
+"""`worldstate array list`: list the boards that --array takes by name.
 
-Print microphones, spacing, whether a model ships for it, and where the positions come from. Without a model
-that ships, `worldstate model make --array NAME` makes one.
+Print microphones, spacing, whether a model ships for the board, and the source of the positions. For a board
+without a shipped model, `worldstate model make --array NAME` makes one.
 
 Examples
 --------
@@ -20,7 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.files.array_file import named_arrays, shipped_models
 
     rows: dict[str, dict[str, object]] = {}

@@ -1,4 +1,4 @@
-"""A program of commands: it finds the one that is called, imports its module alone, and runs it."""
+"""A program of commands: it imports only the module of the called command, and runs it."""
 
 import argparse
 import ast
@@ -25,36 +25,34 @@ from worldstate.ground.version import __version__
 from .output import CommandResult, print_result, printable, say
 
 _WIDTH = 80  # of the overview, characters
-# No system has longer paths, and Python reads no number of more digits than 4,300.
+# No system has longer paths, and Python reads no number with more than 4,300 digits.
 _LONGEST_WORD = 4096
-_HELP = "-h", "--help"
+_HELP = "help", "-h", "--help"
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
     """A program and its commands.
 
-    The documentation of a command's module is "`PROGRAM [GROUP] NAME`: summary.", the description, and
-    examples in the last paragraph; the module has `add_options` and `run`, and `NEEDS`, the optional modules
-    without which it does nothing. Where it has `FIRST_OPTIONS`, `--help` shows those and the first paragraph
-    only, and `--help-all` everything.
+    The docstring of a command's module is "`PROGRAM [GROUP] NAME`: summary.", the description, and examples
+    as the last paragraph. The module has `add_options`, `run`, and optionally `NEEDS`, its optional modules.
     """
 
     name: str
     description: str
     epilog: str
-    commands: Mapping[str, str]  # The words of a command to its module
+    commands: Mapping[str, str]  # From the words of a command to its module
     groups: Mapping[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()  # Left out of the overview
-    # Options that are gone to their successors
+    # From removed options to their successors
     former_options: Mapping[str, str] = field(default_factory=dict)
 
     def called(self, words: Sequence[str]) -> str | None:
-        """Return the words of the command that a call names, None where it names none."""
+        """Return the words of the called command, None without one."""
         return next((name for n in (2, 1) if (name := " ".join(words[:n])) in self.commands), None)
 
     def members(self, group: str) -> list[str]:
-        """Return the names of the commands of a group that are not hidden; of "" those that stand alone."""
+        """Return the commands of a group that are not hidden; "" is the group of commands without one."""
         split = (words.rpartition(" ") for words in self.commands if words not in self.hidden)
         return [name for home, _, name in split if home == group]
 
@@ -86,10 +84,7 @@ class CommandParser(argparse.ArgumentParser):
         _, told, examples = _documentation(module.__doc__ or "")
         form = argparse.RawDescriptionHelpFormatter
         super().__init__(program, description=told, epilog=examples, formatter_class=form, allow_abbrev=False)
-        self.first: tuple[str, ...] = getattr(module, "FIRST_OPTIONS", ())
         self.add_argument("--json", action="store_true", help="print the result as one JSON object")
-        if self.first:
-            self.add_argument("--help-all", action=_HelpAll, nargs=0, help="show every option and exit")
         self.set_defaults(run=module.run, needs=getattr(module, "NEEDS", ()))
         module.add_options(self)
 
@@ -97,26 +92,9 @@ class CommandParser(argparse.ArgumentParser):
         """Refuse a call."""
         super().error(printable(message))
 
-    def format_help(self) -> str:
-        """Return the help; only the first options and the first paragraph where there are many."""
-        if not self.first:
-            return super().format_help()
-        shown = {*self.first, *_HELP, "--json", "--help-all"}
-        hidden = [one for one in self._actions if one.option_strings and not shown & {*one.option_strings}]
-        told, description = [one.help for one in hidden], self.description or ""
-        self.description = description.partition("\n\n")[0]
-        for one in hidden:
-            one.help = argparse.SUPPRESS
-        try:
-            return super().format_help()
-        finally:
-            self.description = description
-            for one, text in zip(hidden, told, strict=True):
-                one.help = text
-
 
 class _Printable(logging.Formatter):
-    """Writes what is logged for a terminal."""
+    """Formats log records for a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
@@ -124,24 +102,16 @@ class _Printable(logging.Formatter):
 
 
 class _New(logging.Filter):
-    """Leaves out what is the same as the line before: a file that is read twice has the same faults."""
+    """Drops a repeated line: a file that is read twice has the same faults."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Tell whether a line is another one."""
+        """Return whether a line differs from the line before."""
         before, self._last = getattr(self, "_last", None), record.getMessage()
         return self._last != before
 
 
-class _HelpAll(argparse.Action):
-    """Prints the help of every option."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *rest: object) -> None:
-        print(argparse.ArgumentParser.format_help(parser), end="")
-        parser.exit()
-
-
 def _docstring(module: str) -> str:
-    """Return the documentation of a module that is not imported: a study takes more than a second."""
+    """Return the docstring of a module without an import, which can take more than a second."""
     found = find_spec(module)
     if found is None or found.origin is None:
         return ""
@@ -149,7 +119,7 @@ def _docstring(module: str) -> str:
 
 
 def _documentation(docstring: str) -> tuple[str, str, str]:
-    """Return the summary of a command, its description and its examples, the last paragraph."""
+    """Return the summary of a command, its description, and its examples in the last paragraph."""
     head, _, rest = docstring.partition("\n\n")
     description, _, examples = f"\n\n{rest.strip()}".rpartition("\n\n")
     examples = examples.replace("Examples\n--------", "examples:")
@@ -157,13 +127,13 @@ def _documentation(docstring: str) -> tuple[str, str, str]:
 
 
 def add_choice(parser: argparse.ArgumentParser, option: str, help_text: str, *choices: str) -> None:
-    """Declare an option that takes one of several words; the first is the default, which the help names."""
+    """Declare an option with several choices; the first one is the default."""
     told = f"{help_text} (default: {choices[0]})".strip()
     parser.add_argument(option, choices=choices, default=choices[0], help=told)
 
 
 def check_beside(arguments: argparse.Namespace, **other_of: str) -> None:
-    """Refuse options, by name, that were given without the other one that they belong to.
+    """Refuse an option without the other option that it requires.
 
     Examples
     --------
@@ -171,7 +141,7 @@ def check_beside(arguments: argparse.Namespace, **other_of: str) -> None:
     """
     given = vars(arguments)
     for one, other in other_of.items():
-        # A number may be 0 where it is given, as that of a camera.
+        # A given number may be 0, such as the number of a camera.
         if given[one] not in (None, []) and (given[other] is None or given[other] is False):
             option, beside = (f"--{name.replace('_', '-')}" for name in (one, other))
             raise InvalidArgumentError(f"{option}: expected {beside} with it")
@@ -188,11 +158,11 @@ def run_program(
 
     `current` replaces former words of a call, `prepare` adds options to the parser of every command.
     """
-    if logging.lastResort is not None:  # what prints warnings where no program has set up logging
+    if logging.lastResort is not None:  # Prints warnings if the program has set up no logging
         logging.lastResort.setFormatter(_Printable())
         logging.lastResort.filters[:] = [_New()]
     try:
-        # SIGTERM is an exception, so that unfinished files are removed on the way out; exit code 143.
+        # SIGTERM raises an exception, so that unfinished files are removed; exit code 143.
         with _handled((signal.SIGTERM,), _terminate):
             code = _execute(program, current(words), prepare)
             sys.stdout.flush()
@@ -212,7 +182,7 @@ def run_program(
 
 
 def _discard_unwritable_output() -> None:
-    """Drop what standard output does not take: the interpreter would write it once more, and complain."""
+    """Drop unwritten output; otherwise the interpreter writes it again at its exit and fails."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -220,7 +190,7 @@ def _discard_unwritable_output() -> None:
 
 
 def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandParser], None]) -> int:
-    """Run the command that is called and print what it found; return its exit code."""
+    """Run the called command and print its result; return its exit code."""
     if any("\0" in word or len(word) > _LONGEST_WORD for word in words):
         raise InvalidArgumentError(f"words: expected at most {_LONGEST_WORD} characters each, no null byte")
     called = program.called(words)
@@ -233,7 +203,7 @@ def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandP
         if option in program.former_options and option not in parser._option_string_actions:
             raise InvalidArgumentError(f"{option}: expected {program.former_options[option]} in its place")
     arguments = parser.parse_args(given)
-    # They mean the same wherever they are.
+    # These options have one meaning in all commands.
     in_range("--seed", getattr(arguments, "seed", 0), 0, 2**63)
     in_range("--jobs", getattr(arguments, "jobs", 1), 1, 256)
     check_extra(*arguments.needs)
@@ -244,34 +214,33 @@ def _execute(program: Program, words: Sequence[str], prepare: Callable[[CommandP
 
 
 def _check_paths(arguments: argparse.Namespace) -> None:
-    """Refuse a pipe or device in the place of a file: it may never begin, or never end."""
+    """Refuse a pipe or device in place of a file, because it may never begin or end."""
     given = (value if isinstance(value, list) else [value] for value in vars(arguments).values())
     for path in (one for values in given for one in values if isinstance(one, Path)):
-        with suppress(OSError):  # what opens it says why it cannot be looked at
+        with suppress(OSError):  # Raised again when the file is opened
             if path.exists() and not (path.is_file() or path.is_dir()):
                 raise InputFileError(path, "expected a file, found a device or pipe")
 
 
 def _without_command(program: Program, words: Sequence[str]) -> int:
-    """Print the version or the overview; refuse a word that is no command."""
-    first, second = words[:2] if len(words) > 1 else (words[0], "")
-    group = first if first in program.groups else None
-    if first in _HELP or (group and second in _HELP):
-        print(program.overview(group))
-        return 0
-    if first == "--version":
+    """Print the version, the overview of the program or of a group; refuse an unknown command."""
+    if words[0] == "--version":
         print(program.name, __version__)
         return 0
+    asked = [word for word in words if word and word not in _HELP]
+    group = asked.pop(0) if asked and asked[0] in program.groups else None
+    if not asked:
+        print(program.overview(group))
+        return 0
     named = program.members(group) if group else [*program.members(""), *program.groups]
-    got = f", got {second if group else first}" if (second if group else first) else ""
-    raise InvalidArgumentError(f"{group or 'command'}: expected one of {', '.join(named)}{got}")
+    raise InvalidArgumentError(f"{group or 'command'}: expected one of {', '.join(named)}, got {asked[0]}")
 
 
 @contextmanager
 def _handled(
     numbers: Sequence[int], handler: Callable[[int, object], None], *, once: bool = False
 ) -> Iterator[None]:
-    """Handle signals by a function while the block runs; `once`, from the second on as before."""
+    """Handle signals by a function while the block runs; with `once` only the first signal."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -295,7 +264,7 @@ def _handled(
 
 
 def stopped_by_signals(stop: Callable[[], None]) -> AbstractContextManager[None]:
-    """Call `stop` at the first SIGINT or SIGTERM; the second one does what it did before."""
+    """Call `stop` at the first SIGINT or SIGTERM; the second signal has its former effect."""
     return _handled((signal.SIGINT, signal.SIGTERM), lambda number, frame: stop(), once=True)
 
 

@@ -1,4 +1,4 @@
-"""--export: viewers, logs and other stacks that a command sends world-states to, hop by hop."""
+"""--export: viewers, logs and other stacks that receive the states of a command, hop by hop."""
 
 import argparse
 import itertools
@@ -26,54 +26,55 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 FOXGLOVE_PORT = 8765
-CROSSING_M = 9.0
-# Exporters of the library, with the optional module that each needs.
+# Exporters of the library, each with its optional module.
 EXPORTERS = {
     "mcap": "mcap", "foxglove": "foxglove", "rerun": "rerun", "osi": "osi3", "autoware": None, "odas": None,
     "mot": None, "rosbag": "rosbags", "rosbag-sqlite3": "rosbags",
 }  # fmt: skip
+_EXTRAS = {"figure": "matplotlib", "camera_device": "cv2", "view": "rich", "web": "websockets"}
 _FILES = "mcap", "rerun", "osi", "autoware", "mot"
-# These are given messages on topics, the others states.
+# These exporters take messages on topics, the others take states.
 _VIEWERS = "mcap", "rerun", "foxglove"
 
 
 def add_output_options(parser: argparse.ArgumentParser, *, pages: bool = True) -> "argparse._ArgumentGroup":
-    """Declare --out, --export and --origin, where states go; return their group.
+    """Declare --out, --export and --origin; return their group.
 
-    --export NAME=TARGET sends states on, and may be repeated:
+    --export NAME=TARGET sends the states to another program, and may be repeated:
       mcap=FILE            snapshots and scene for Foxglove
       foxglove[=PORT]      the same on a websocket, in real time (8765)
       rerun=FILE           the same for the Rerun viewer
-      osi=FILE             a trace of ASAM OSI SensorData; of NAME.mcap one in MCAP under OSI's file name
-      autoware=FILE        Autoware's PredictedObjects, one a line
-      mot=FILE             places as MOTChallenge text of 2015; what is only heard has none
-      odas=HOST:PORT       tracks as ODAS sends them; ODAS Studio listens at port 9000
+      osi=FILE             a trace of ASAM OSI SensorData; for NAME.mcap in MCAP, under OSI's file name
+      autoware=FILE        Autoware's PredictedObjects, one per line
+      mot=FILE             positions as MOTChallenge text of 2015, without vehicles that have none
+      odas=HOST:PORT       tracks in the form of ODAS; ODAS Studio uses port 9000
       rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3 in that storage
-      NAME=TARGET          what an exporter does that an installed package brings
+      NAME=TARGET          an exporter of an installed package
     """
     describe(parser, add_output_options)
     group = parser.add_argument_group("output")
-    group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot a line")
-    told = "send states to a viewer, a log or another stack; repeated"
-    group.add_argument("--export", action="append", default=[], metavar="NAME=TARGET", help=told)
+    group.add_argument("--out", type=Path, metavar="JSONL", help="write one snapshot per line")
+    text = "send states to a viewer, a log or another stack; may be repeated"
+    group.add_argument("--export", action="append", default=[], metavar="NAME=TARGET", help=text)
     if pages:
-        told = "let web pages of this origin see the websocket, such as https://app.foxglove.dev; repeated"
-        group.add_argument("--origin", action="append", metavar="URL", help=told)
+        text = "allow web pages of this origin, such as https://app.foxglove.dev; may be repeated"
+        group.add_argument("--origin", action="append", metavar="URL", help=text)
     parser.set_defaults(origin=[])
     return group
 
 
 def exported_files(arguments: argparse.Namespace) -> dict[str, Path]:
-    """Return the files that --export writes, by option."""
+    """Return the files of --export by option."""
     files = [(name, target) for name, target in _asked(arguments) if name in _FILES]
     return {f"export {name} ({n})": Path(target) for n, (name, target) in enumerate(files, start=1)}
 
 
 def needed_extras(arguments: argparse.Namespace) -> list[str]:
-    """Return the optional modules that --export and --web need."""
-    served = ["websockets"] if getattr(arguments, "web", None) is not None else []
-    found = [*(EXPORTERS.get(name) for name, _ in _asked(arguments)), *served]
-    return [module for module in found if module is not None]
+    """Return the optional modules that the options for output need."""
+    given = vars(arguments)
+    found = [module for option, module in _EXTRAS.items() if given.get(option) not in (None, False)]
+    found += [module for name, _ in _asked(arguments) if (module := EXPORTERS.get(name)) is not None]
+    return found
 
 
 def _asked(arguments: argparse.Namespace) -> list[tuple[str, str]]:
@@ -87,10 +88,10 @@ def _asked(arguments: argparse.Namespace) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Exports:
-    """Everything that states are passed on to."""
+    """The open targets of --export."""
 
-    viewers: "list[LogSink]" = field(default_factory=list)  # These take messages
-    stacks: "list[Callable[[WorldState], object]]" = field(default_factory=list)  # These take states
+    viewers: "list[LogSink]" = field(default_factory=list)  # Take messages
+    stacks: "list[Callable[[WorldState], object]]" = field(default_factory=list)  # Take states
 
     def message(self, message: "LogMessage") -> None:
         """Pass a message on to every viewer."""
@@ -109,12 +110,12 @@ class Exports:
 
 @contextmanager
 def open_exports(
-    arguments: argparse.Namespace, *, crossing_m: float = CROSSING_M, live: bool = False
+    arguments: argparse.Namespace, *, crossing_m: float = 9.0, live: bool = False
 ) -> Iterator[Exports]:
-    """Open everything that was asked for.
+    """Open the targets of --export.
 
-    What comes too soon is played at the speed of its stamps, and files take their name at the end; not so of
-    a `live` run, which sets the pace and has no end: only its bags and Rerun files do.
+    A recording is sent at the pace of its time stamps, and its files get their names at the end. A `live` run
+    has its own pace and no end, so that only its bags and Rerun files get their names at the end.
     """
     with ExitStack() as opened:
         exports = Exports()
@@ -127,7 +128,7 @@ def open_exports(
 
 
 def most_bytes(arguments: argparse.Namespace) -> int | None:
-    """Return when a log is full, by --rotate-mib where the command has it."""
+    """Return the largest size of a log by --rotate-mib, None without it."""
     most_mib: int | None = getattr(arguments, "rotate_mib", None)
     return None if most_mib is None else int(in_range("--rotate-mib", most_mib, 1, 1 << 30)) << 20
 
@@ -181,16 +182,16 @@ def _stack(name: str, target: str, crossing_m: float, live: bool, arguments: arg
 
 @contextmanager
 def _expendable(target: str, stack: "Stack") -> "Iterator[Callable[[WorldState], object]]":
-    """Lend what a bag lends: one that cannot be written is a notice and not the end of a run."""
+    """Yield the function of a bag; if the bag cannot be written, a notice follows and the run continues."""
     failed = False
 
     def tried(write: Callable[[], object]) -> None:
         nonlocal failed
         try:
             write()
-        except Exception as error:  # SQLite and MCAP have errors of their own
+        except Exception as error:  # SQLite and MCAP raise their own errors
             if not failed:
-                _LOG.warning("%s: nothing is kept: %s", target, error)
+                _LOG.warning("%s: cannot be written: %s", target, error)
             failed = True
 
     with ExitStack() as opened:
@@ -201,10 +202,10 @@ def _expendable(target: str, stack: "Stack") -> "Iterator[Callable[[WorldState],
 
 @contextmanager
 def exported_hops(
-    arguments: argparse.Namespace, source: "adapters.Source", crossing_m: float, *, live: bool = False
+    arguments: argparse.Namespace, source: "adapters.Source", *, live: bool = False
 ) -> "Iterator[Callable[[adapters.Step], None]]":
-    """Lend a function that exports a hop of a recording: state, power over azimuth, image and sound."""
-    with open_exports(arguments, crossing_m=crossing_m, live=live) as exports:
+    """Yield a function that exports a hop: state, power over azimuth, image and sound."""
+    with open_exports(arguments, crossing_m=source.crossing_m, live=live) as exports:
         if not exports.viewers:
             yield lambda step: exports.state(step.state)
             return

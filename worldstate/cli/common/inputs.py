@@ -1,207 +1,289 @@
-"""What a command listens to, and by which microphones: INPUT, --array, where a bearing is looked for."""
+"""Options that several commands share: recording, array, camera, model, place."""
 
 import argparse
-import io
-import re
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from inspect import getdoc
-from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, cast
+from typing import TYPE_CHECKING
 
 from worldstate import adapters, frontend
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 if TYPE_CHECKING:
-    from worldstate.adapters.audio.plain_samples import Encoding
+    from worldstate.abduction.sequence.street_sides import SidePatterns
     from worldstate.adapters.audio.sound_file import Audio, SoundInput
+    from worldstate.adapters.source import Source
+    from worldstate.state import Context
 
 _EXAMPLE = "  arecord -D hw:1 -t raw -f S32_LE -r 48000 -c 8 | {} pcm:48000:8:s32"
-_RAW = "pcm:"
-_TOPICS = "audio", "detections", "odometry"
-# Below this a coordinate does not spread, metres.
+# An array with a smaller extent along an axis is flat, metres.
 _FLAT_M = 0.005
 
 
 def describe(parser: argparse.ArgumentParser, declare: Callable[..., object]) -> None:
-    """Add to a command's description what stands below the first line of a function's docstring."""
-    _, _, told = (getdoc(declare) or "").partition("\n\n")
-    parser.description = f"{parser.description}\n\n{told}"
+    """Append the docstring of a function, except its first line, to the description of a command."""
+    _, _, text = (getdoc(declare) or "").partition("\n\n")
+    parser.description = f"{parser.description}\n\n{text}"
 
 
 def add_sound_options(parser: argparse.ArgumentParser) -> None:
-    """Declare INPUT, --topic and --audio-format.
+    """Declare INPUT and --topic.
 
-    INPUT is a multichannel sound file (WAV, RF64, W64, FLAC), the folder of one recording in the OVAD layout
-    (out_multi.wav and, where there is one, camera_baseline_results.json), several files of one channel each
-    in the order of the microphones, a bag of ROS 2 (its folder, .mcap or .db3), or raw samples on standard
-    input: pcm:RATE:CHANNELS:FORMAT, with s16, s24, s24_32 (24 bits in four bytes, arecord's S24_LE), s32
-    (little-endian whole numbers) or f32 (floats) as FORMAT.
+    INPUT is one of
+      a multichannel sound file (WAV, RF64, W64, FLAC), or one file per microphone in their order
+      a folder with one recording in the OVAD layout (out_multi.wav)
+      a bag of ROS 2 (folder, .mcap or .db3)
+      pcm:RATE:CHANNELS:FORMAT, raw samples on standard input: s16, s24, s24_32 (24 bits in four bytes, as
+      arecord's S24_LE), s32 or f32, little-endian
     """
     describe(parser, add_sound_options)
     parser.epilog = f"{parser.epilog}\n{_EXAMPLE.format(parser.prog)}"
-    what = "sound file, recording folder, a file a microphone, bag, or pcm:RATE:CHANNELS:FORMAT"
+    what = "sound file, recording folder, one file per microphone, bag, or pcm:RATE:CHANNELS:FORMAT"
     parser.add_argument("input", type=Path, nargs="+", metavar="INPUT", help=what)
-    topic = "audio=, detections= or odometry=TOPIC of a bag (default: the only one of its type); repeated"
+    topic = (
+        "audio=, detections= or odometry=TOPIC of a bag, if it has several of a type; may be repeated; "
+        "audio=TOPIC:RATE:CHANNELS:FORMAT if the messages do not state the format"
+    )
     parser.add_argument("--topic", action="append", default=[], metavar="NAME=TOPIC", help=topic)
-    told = "RATE:CHANNELS:FORMAT of the sound of a bag whose messages do not state it (no AudioInfo)"
-    parser.add_argument("--audio-format", metavar="FORMAT", help=told)
-    add_channel_option(parser)
-
-
-def add_channel_option(parser: argparse.ArgumentParser) -> None:
-    """Declare --channels."""
-    told = "channels of the microphones, from 1: 2-5 or 1,3,5-8, where there are more (default: the array's)"
-    parser.add_argument("--channels", metavar="LIST", help=told)
 
 
 def add_array_options(
     parser: argparse.ArgumentParser,
-    default: str = "the data set's, OVAD's where it names none",
+    default: str = "the data set's, or OVAD's",
     action: str = "store",
 ) -> None:
-    """Declare --array and --array-axes.
+    """Declare --array.
 
-    --array FILE holds one microphone a channel, in the order of the channels, in metres:
-      XML   Acoular's and OVAD's <pos x= y= z= />: the array plane seen from behind, x right, y up, z forward
-      CSV   x,y,z a line, with or without header and names: base_link, x forward, y left, z up
-      JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...], "axes": "base_link"}: base_link, too;
-            "channels": [2, 3, 4, 5] of a card with more channels than microphones
-      .cfg  a configuration of ODAS: mics = ( { mu = ( x, y, z ); ... }, ... ), its map as the channels
-    (other units: a header x_mm,y_mm,z_mm, or "positions_mm"),
-    or is the name of a board that lies flat, x forward: respeaker-4, respeaker-6, respeaker-usb, uma-8, xmos,
-    or that stands upright and faces forward: uma-16
+    --array takes a file with one microphone per channel, in metres, x forward, y left, z up:
+      CSV   x,y,z per line; a header such as x_mm,y_mm,z_mm states another unit
+      JSON  [[x, y, z], ...] or {"positions_m": [[x, y, z], ...]}; optional "channels": [2, 3, 4, 5] for a
+            sound card with more channels, "axes": "acoular"
+      XML   of Acoular and OVAD, in their axes (x right, y up, z forward)
+      .cfg  of ODAS
+    or a board: respeaker-4, respeaker-6, respeaker-usb, uma-8, xmos (flat, x forward), uma-16 (upright)
     """
     describe(parser, add_array_options)
-    add = parser.add_argument
-    told = f"microphone positions (default: {default})"
-    add("--array", type=Path, action=action, metavar="FILE", help=told)
-    axes = "x right, y up, z forward, or x forward, y left, z up (default: by the form of the file)"
-    add("--array-axes", choices=("acoular", "base_link"), help=axes)
+    text = f"microphone positions, or a board (default: {default})"
+    parser.add_argument("--array", type=Path, action=action, metavar="FILE", help=text)
 
 
 def add_search_options(parser: argparse.ArgumentParser) -> None:
-    """Declare --band and --azimuth-span: where a bearing is looked for."""
+    """Declare --band and --azimuth-span, the range of the search for a bearing."""
     add = parser.add_argument
-    band = "band of the bearing, Hz (default: by the spacing of the microphones; 300 to 1800 for the roof)"
+    band = "frequency band of the bearing, Hz (default: by the spacing of the microphones)"
     add("--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help=band)
-    span = "sector ahead that is searched, 360 for all round (default: by the array, or its model)"
+    span = "width of the searched sector ahead, degrees (default: by the array)"
     add("--azimuth-span", type=float, metavar="DEG", help=span)
 
 
-def topics_of(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return the topics that were asked for, by what they hold."""
+def add_sensor_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --array, --car, --detections and --camera.
+
+    --detections takes OVAD's JSON, COCO results (a list, or an object with "images" and "annotations"),
+    MOTChallenge text (.txt) or a folder of YOLO text. The first image is taken at the first sample.
+    """
+    add_array_options(parser)
+    add_car_options(parser)
+    describe(parser, add_sensor_options)
+    text = "detections of the camera; NAME=PATH for a camera of --car, may be repeated"
+    parser.add_argument("--detections", type=Path, action="append", default=[], metavar="PATH", help=text)
+
+
+def add_car_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --car and --camera.
+
+    --car takes JSON, x forward, y left, z up; every key is optional:
+      {"array": {"file": "mics.csv", "position_m": [1.2, 0, 1.6], "pitch_deg": -5},
+       "cameras": [{"name": "front", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90,
+                    "position_m": [1.9, 0, 1.3], "detections": "front.json", "miss_rates": "beta.json"}],
+       "model": "mine.json", "odometry": "odometry.csv", "measurements": {"radar": "radar.csv"}}
+    --camera takes JSON with the keys of one of these cameras, or its name. Further keys: "fx" and "cx" in
+    place of the field of view; "yaw_deg", "pitch_deg", "roll_deg"; "stamp_offset_s"; "image_rate_hz" (10)
+    for images without time stamps; "classes", "min_score" and "min_box_px" of the boxes that are used;
+    "labels" of an ONNX model.
+    """
+    describe(parser, add_car_options)
+    add = parser.add_argument
+    add("--car", type=Path, metavar="FILE", help="array, cameras, odometry, model and sensors of a vehicle")
+    lens = "the camera, or its name in --car (default: the first of --car; OVAD's for OVAD's array)"
+    add("--camera", type=Path, metavar="JSON", help=lens)
+
+
+def add_detector_option(parser: argparse.ArgumentParser, default: str | None = "motion") -> None:
+    """Declare --detector."""
+    text = (
+        "detector for the video: motion or knn (background subtraction), FILE.onnx (YOLO), or the name of "
+        f"an installed one (default: {default or 'none'})"
+    )
+    parser.add_argument("--detector", metavar="NAME", default=default, help=text)
+
+
+def add_listen_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --model, --budget, --alpha, --uncalibrated and --context.
+
+    --context takes a file of `street learn`, or JSON:
+      {"arms": [{"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0}, ...]}
+    with the corner that hides the arm (x ahead, y left) and the distance of the lane behind it, metres, or
+    "open": true; optional "speed_mps" and "corner_std_m" of an arm, "rates", "priors", "ego_speed_mps",
+    "site", "view_half_angle_deg".
+    """
+    describe(parser, add_listen_options)
+    add = parser.add_argument
+    add("--model", type=Path, help="model file, or the name of a shipped model (default: by the array)")
+    add_budget_options(parser)
+    text = "use a model that was made for another array or sample rate; cues then state no budget"
+    add("--uncalibrated", action="store_true", help=text)
+    text = "corners, lanes and rates of this place (default: a usual blind junction)"
+    add("--context", type=Path, metavar="FILE", help=text)
+
+
+def add_budget_options(parser: argparse.ArgumentParser) -> None:
+    """Declare --budget and --alpha, which set the threshold of the alarm."""
+    add = parser.add_mutually_exclusive_group().add_argument
+    add("--budget", type=float, metavar="ONSETS", help="false alarms per hour (default: the model's)")
+    add("--alpha", type=float, metavar="SHARE", help="or the share of hazard-free time in alarm")
+
+
+def add_memory_options(parser: argparse.ArgumentParser, start: str) -> None:
+    """Declare --resume, --start and --save-state; `start` describes the default of --start."""
+    add = parser.add_argument
+    add("--resume", type=Path, metavar="STATE", help="continue from a file of --save-state")
+    first = f"time of the first sample on the clock of the states (default: {start})"
+    add("--start", type=float, metavar="S", help=first)
+    add("--save-state", type=Path, metavar="STATE", help="save belief and site for --resume")
+
+
+def named(option: str, texts: list[str]) -> dict[str, str]:
+    """Return the values of a repeated option NAME=VALUE.
+
+    Examples
+    --------
+    >>> named("--topic", ["audio=/front"])
+    {'audio': '/front'}
+    """
+    if not texts:
+        return {}
     from worldstate.adapters.own_parts import part_and_target
 
-    named = dict(part_and_target("--topic", text) for text in arguments.topic)
-    if not named.keys() <= {*_TOPICS}:
-        raise InvalidArgumentError(f"--topic: expected {', '.join(_TOPICS)}, got {', '.join(named)}")
-    return named
+    pairs = [part_and_target(option, text) for text in texts]
+    if len(dict(pairs)) < len(pairs):
+        raise InvalidArgumentError(f"{option}: expected different names, got {' '.join(texts)}")
+    return dict(pairs)
 
 
-def sound_of(arguments: argparse.Namespace) -> "SoundInput":
-    """Return what INPUT names."""
-    return _sound_and_own_array(arguments)[0]
+def reported(arguments: argparse.Namespace) -> str | dict[str, str] | None:
+    """Return the values of --detections: of one camera, or by the names of several cameras of --car."""
+    given = [str(one) for one in arguments.detections]
+    if arguments.car is not None and any("=" in text for text in given):
+        return named("--detections", given)
+    if len(given) > 1:
+        raise InvalidArgumentError("--detections: expected one, or --car with NAME=... of its cameras")
+    return next(iter(given), None)
 
 
-def _sound_and_own_array(
-    arguments: argparse.Namespace,
-) -> "tuple[SoundInput, frontend.MicrophoneArray | None]":
-    """Return what INPUT names, and the array that a bag holds."""
-    from worldstate.adapters.audio.sound_file import as_sound
-    from worldstate.adapters.ros.bag_input import read_sound
+def described_camera(arguments: argparse.Namespace) -> str:
+    """Return the option that describes a camera, "" without one."""
+    from worldstate.adapters.source import SourceSensors
 
-    stated = vars(arguments).get("audio_format")  # Not an option of what draws a log
-    if (bag := bag_of(arguments)) is not None:
-        pcm = None if stated is None else _pcm("--audio-format", stated, io.BytesIO(), str(bag))
-        return read_sound(bag, topics_of(arguments).get("audio"), pcm)
-    if stated is not None or arguments.topic:
-        option = "--topic" if stated is None else "--audio-format"
-        raise InvalidArgumentError(f"{option}: expected a bag as INPUT; samples without one are {_RAW}...")
-    names = [str(path) for path in arguments.input]
-    raw = next((name for name in names if name == "-" or name.startswith(_RAW)), None)
-    if raw is None:
-        return as_sound(tuple(arguments.input)), None
-    if len(names) > 1 or raw == "-":
-        raise InvalidArgumentError(f"{raw}: expected standard input alone, as {_RAW}RATE:CHANNELS:FORMAT")
-    return _pcm(raw, raw.removeprefix(_RAW), sys.stdin.buffer), None
+    known = SourceSensors.of(None, arguments.car, arguments.camera).camera
+    return "" if known is None else "cameras of --car" if arguments.camera is None else "--camera"
 
 
-def _pcm(name: str, text: str, stream: BinaryIO, path: str = "/dev/stdin") -> "adapters.RawPcm":
-    told = text.split(":")
-    if not (len(told) in (2, 3) and told[0].isdecimal() and told[1].isdecimal()):
-        raise InvalidArgumentError(f"{name}: expected RATE:CHANNELS:FORMAT, such as 48000:8:s32")
-    rate, channels, kind = [*told, "s16"][:3]
-    return adapters.RawPcm(stream, int(rate), int(channels), cast("Encoding", kind), path)
+def place_of(path: Path | None) -> "tuple[Context | None, SidePatterns | None]":
+    """Return the context of a file, and the sound of its arms if `street learn` wrote it."""
+    from worldstate.adapters.files.context_file import read_context
+    from worldstate.adapters.files.file_io import read_json
 
+    if path is None:
+        return None, None
+    content = read_json(path, "a context file")
+    if not (isinstance(content, dict) and "schema" in content):
+        return read_context(path), None
+    from worldstate.operations.labelling.street_passes import read_street  # Slow to import
+    from worldstate.smoothing.learned_street import context_of
 
-def bag_of(arguments: argparse.Namespace) -> Path | None:
-    """Return the bag that INPUT names, None where it is none."""
-    from worldstate.adapters.ros.bag_input import is_bag
-
-    alone = arguments.input[0] if len(arguments.input) == 1 else None
-    return alone if alone is not None and is_bag(alone) else None
+    street = read_street(path)
+    return context_of(street), street.patterns
 
 
 def given_array(arguments: argparse.Namespace) -> "frontend.MicrophoneArray | None":
-    """Return the array that --array names, None without it: a recording may then bring its own."""
-    given = None if arguments.array is None else adapters.read_array(arguments.array, arguments.array_axes)
-    return with_channels(arguments, given)
-
-
-def with_channels(
-    arguments: argparse.Namespace, array: "frontend.MicrophoneArray | None"
-) -> "frontend.MicrophoneArray | None":
-    """Return the array, its channels those of --channels where that is given."""
-    text = getattr(arguments, "channels", None)
-    if text is None:
-        return array
-    if array is None:
-        raise InvalidArgumentError("--channels: expected --array, or --car with an array, that they are of")
-    parts = [re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part.strip()) for part in text.split(",")]
-    ranges = [range(int(one[1]), int(one[2] or one[1]) + 1) for one in parts if one is not None]
-    if len(ranges) < len(parts) or not all(ranges):
-        raise InvalidArgumentError(f"--channels: expected such as 2-5 or 1,3,5-8, got {text!r:.40}")
-    return replace(array, channels=tuple(chain(*ranges)))
-
-
-def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
-    """Return where a bearing is looked for, all else by default."""
-    band = None if arguments.band is None else (arguments.band[0], arguments.band[1])
-    return adapters.ListenSettings(band_hz=band, azimuth_span_deg=arguments.azimuth_span)
-
-
-def _sound_and_array(arguments: argparse.Namespace) -> "tuple[SoundInput, frontend.MicrophoneArray]":
-    """Return what INPUT and --array name, or the array that belongs to the sound."""
-    from worldstate.adapters.audio.sound_file import path_of
-    from worldstate.adapters.datasets.ovad import choose_array
-    from worldstate.adapters.ros.bag_input import BagSound, needed_array
-
-    sound, own = _sound_and_own_array(arguments)
-    if isinstance(sound, BagSound):
-        return sound, needed_array(sound, given_array(arguments) or own)
-    array = choose_array(path_of(sound), given_array(arguments))
-    if isinstance(sound, Path) and sound.is_dir():
-        sound = adapters.Recording.open(sound).audio_path
-    return sound, array
+    """Return the array of --array, None without it."""
+    return None if arguments.array is None else adapters.read_array(arguments.array)
 
 
 @contextmanager
 def opened_front_end(arguments: argparse.Namespace) -> "Iterator[tuple[Audio, frontend.FrontEnd]]":
-    """Open what INPUT and --array name, and the front-end that hears it."""
-    from worldstate.adapters.audio.sound_file import open_sound
+    """Open the recording of INPUT and the front-end for its array."""
+    from worldstate.adapters.audio.sound_file import open_sound, path_of
+    from worldstate.adapters.datasets.ovad import choose_array
+    from worldstate.adapters.ros.bag_input import BagSound, needed_array
+    from worldstate.adapters.source import sound_of
 
-    sound, array = _sound_and_array(arguments)
+    sound, own = sound_of(arguments.input, named("--topic", arguments.topic))
+    if isinstance(sound, BagSound):
+        array = needed_array(sound, given_array(arguments) or own)
+    else:
+        array = choose_array(path_of(sound), given_array(arguments))
+        if isinstance(sound, Path) and sound.is_dir():
+            sound = adapters.Recording.open(sound).audio_path
     with open_sound(sound, array.n_microphones, channels=array.channels, strict=False) as audio:
         settings = search_of(arguments).front_end(array, audio.sample_rate_hz)
         yield audio, frontend.FrontEnd(array, audio.sample_rate_hz, settings)
 
 
+def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
+    """Return the settings with --band and --azimuth-span."""
+    band = None if arguments.band is None else (arguments.band[0], arguments.band[1])
+    return adapters.ListenSettings(band_hz=band, azimuth_span_deg=arguments.azimuth_span)
+
+
+def check_boxes(arguments: argparse.Namespace, recordings: int) -> None:
+    """Refuse the boxes of one recording, by --detections or by the camera of --car, for several."""
+    from worldstate.adapters.source import SourceSensors
+
+    sensors = SourceSensors.of(None, arguments.car, arguments.camera)
+    if recordings > 1 and (arguments.detections or sensors.setup.detections):
+        problem = "expected one recording with --detections or --car, because folders hold their own boxes"
+        raise InvalidArgumentError(f"{problem}, got {recordings}")
+
+
+def recorded(
+    arguments: argparse.Namespace,
+    path: "SoundInput | list[Path]",
+    settings: "adapters.ListenSettings | None" = None,
+) -> "Source":
+    """Return a recording with its sound and the boxes of its camera, for any array."""
+    return adapters.open_source(
+        path,
+        arguments.array,
+        car=arguments.car,
+        camera=arguments.camera,
+        detections=reported(arguments),
+        topics=named("--topic", getattr(arguments, "topic", [])),
+        settings=settings,
+        uncalibrated=True,
+    )
+
+
+def camera_source(
+    arguments: argparse.Namespace, path: "SoundInput | list[Path]"
+) -> "tuple[Source, adapters.DetectionLog]":
+    """Return a recording, with any array, and the boxes of its camera.
+
+    Raises
+    ------
+    InputFileError
+        If there are no boxes of a camera.
+    """
+    source = recorded(arguments, path)
+    if source.detections is None:
+        raise InputFileError(source.audio_path, "expected boxes of a camera beside it, or --detections")
+    return source, source.detections
+
+
 def stance(array: "frontend.MicrophoneArray") -> str:
-    """Say in one line how an array stands on the vehicle: microphones, extent, what it tells apart.
+    """Describe an array in one line: microphones, extent and ambiguity.
 
     Examples
     --------
@@ -220,5 +302,7 @@ def _apart(x: float, y: float, ambiguity: str) -> str:
     if x < _FLAT_M:
         return "hears front as back"
     if y < _FLAT_M:
-        return "hears left as right: no extent across the vehicle; if that is wrong, see --array-axes"
+        return (
+            "hears left as right: no extent across the vehicle; if that is wrong, check the axes of the file"
+        )
     return "hears a direction as its mirror image in the array"

@@ -1,4 +1,4 @@
-"""What a terminal shows of a run: bearing, risk of each side, entities, and what was lost."""
+"""View of a run in a terminal: bearing, risk of each side, entities and lost sound."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from worldstate.adapters.live.live_listening import LiveStep
     from worldstate.state import Entity, RiskCue, WorldState
 
-# Every second state: ten a second cannot be read, and drawing costs some milliseconds.
+# Every second state: ten per second cannot be read, and drawing takes some milliseconds.
 _SHOWN_EVERY_NS = 200_000_000
-# Characters of the scale of azimuths from 90 degrees left to 90 degrees right: one for five degrees.
+# Characters of the azimuth scale from 90 degrees left to 90 degrees right, one per five degrees.
 _SCALE = 37
 _BAR = 20
-# More are not read at a glance.
+# More cannot be read at a glance.
 _MOST_ENTITIES = 6
 
 
 @contextmanager
 def live_view() -> "Iterator[Callable[[LiveStep], None]]":
-    """Lend a function that shows a hop on standard error."""
+    """Yield a function that shows a hop on standard error."""
     console, last_ns = Console(stderr=True), -_SHOWN_EVERY_NS
     with Live(console=console, auto_refresh=False, transient=True) as screen:
 
@@ -57,7 +57,7 @@ def _bearing(state: "WorldState") -> Text:
     if state.bearing is None:
         return Text("left  " + "·" * _SCALE + "  right   no bearing", style="dim")
     azimuth, std_deg = state.bearing.azimuth_rad, math.degrees(state.bearing.std_rad)
-    # Behind the vehicle there is no scale: the nearer end stands for it.
+    # A bearing behind the vehicle is shown at the nearer end.
     place = round((0.5 - max(min(azimuth / math.pi, 0.5), -0.5)) * (_SCALE - 1))
     scale = "·" * place + "●" + "·" * (_SCALE - 1 - place)
     return Text(f"left  {scale}  right   {math.degrees(azimuth):+.0f} ± {std_deg:.0f} deg")
@@ -83,5 +83,5 @@ def _entities(entities: "tuple[Entity, ...]") -> Table:
         label = max(classes, key=lambda said: said.probability).label if classes else ""
         azimuth = f"{math.degrees(one.azimuth_rad):+.0f} ± {math.degrees(one.azimuth_std_rad):.0f} deg"
         cells = one.id[:8], one.status or "heard", f"{one.existence_probability:.2f}", azimuth, label
-        table.add_row(*(Text(printable(cell)) for cell in cells))  # text alone would be read as markup
+        table.add_row(*(Text(printable(cell)) for cell in cells))  # rich parses plain strings as markup
     return table

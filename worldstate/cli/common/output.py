@@ -1,4 +1,4 @@
-"""What a command found, in print and in files, which are checked before the work: no input is overwritten."""
+"""Results of commands in print and in files, and the checks of files before the work."""
 
 import argparse
 import json
@@ -7,29 +7,32 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from worldstate.ground.errors import InputFileError
 
 from .exports import exported_files
 
-NO_STREET = "the model file holds no numbers of the belief: those that ship are used"
+if TYPE_CHECKING:
+    from worldstate import adapters
+
 _SINCE_1970_S = 1e9
 
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """What a command found."""
+    """Result of a command."""
 
     report: Mapping[str, object]  # One JSON object
-    table: Mapping[str, object] | None = None  # The same for people, where it is not the report itself
-    lines: Iterable[str] = ()  # For people, below the table
+    table: Mapping[str, object] | None = None  # Readable form, if it differs from the report
+    lines: Iterable[str] = ()  # Readable lines below the table
     code: int = 0  # Exit code
 
 
 def printable(text: str) -> str:
-    r"""Return text with all that is no visible character written out, line ends and tabs apart.
+    r"""Return text with every invisible character escaped, except line ends and tabs.
 
-    Names of files, labels and reasons come from others, and a terminal obeys what follows an escape.
+    File names, labels and reasons may contain control sequences of a terminal.
 
     Examples
     --------
@@ -64,6 +67,29 @@ def print_result(result: CommandResult, *, as_json: bool) -> None:
         print(printable(line))
 
 
+def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
+    """Return how many boxes are used and why the others are not, per camera; None without a camera."""
+    from dataclasses import replace
+
+    from worldstate.adapters.camera.detections import count_boxes, told_counts
+
+    keep = replace(source.settings.boxes, image_height_px=source.camera.height_px)
+    held = {} if source.detections is None else {"": (source.detections, keep)}
+    if source.co_evidence is not None:
+        held = {f"{name}: ": (one.detections, one.keep) for name, one in source.co_evidence.cameras.items()}
+    each: Mapping[str, Mapping[str, int]] = {name: count_boxes(*one) for name, one in held.items()}
+    images = 'COCO results list them as "images"'
+    for name, counts in each.items():
+        if not counts["frames"]:
+            say(f"{name}the detector searched no image, so that the camera gives no evidence ({images})")
+        elif not counts["empty"] and not counts["parked"]:
+            say(f"{name}each image has a box: are images without a box missing ({images})?")
+    if source.co_evidence is not None:
+        by_name = {name.removesuffix(": "): counts for name, counts in each.items()}
+        return by_name if as_json else [name + told_counts(counts) for name, counts in each.items()]
+    return next((counts if as_json else told_counts(counts) for counts in each.values()), None)
+
+
 def write_report(path: Path, report: Mapping[str, object]) -> None:
     """Write a report as JSON, whole or not at all."""
     from worldstate.adapters.files.file_io import write_json
@@ -75,13 +101,13 @@ def _readable(value: object) -> str:
     if value is None or value in ((), []):
         return "-"
     if isinstance(value, float):
-        # Times since 1970 are told to the tenth of a second, as hops come.
+        # Times since 1970 are printed to 0.1 s, the length of a hop.
         return f"{value:.4g}" if abs(value) < _SINCE_1970_S else f"{value:.1f}"
     return ", ".join(_readable(item) for item in value) if isinstance(value, tuple | list) else str(value)
 
 
 def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[str, ...] = ()) -> None:
-    """Refuse outputs, those of --export too, that cannot be written, replace an input or are one file.
+    """Refuse outputs that cannot be written, replace an input or coincide, including those of --export.
 
     Examples
     --------
@@ -106,14 +132,14 @@ def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[s
             check_suffix(path)
         target = check_target(path)
         if any(_is_read(target, source) for source in inputs):
-            raise InputFileError(path, "expected another file to write to, this one is read")
+            raise InputFileError(path, "expected another file to write, because this one is an input")
         if target in taken:
             raise InputFileError(path, f"expected another file for --{name} than for --{taken[target]}")
         taken[target] = name
 
 
 def output_folder(folder: Path, *files: str) -> Path:
-    """Make the folder that a command writes to, and refuse one in which its files cannot be written."""
+    """Make the output folder of a command; refuse a folder in which its files cannot be written."""
     from worldstate.adapters.files.file_io import check_target
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -123,7 +149,7 @@ def output_folder(folder: Path, *files: str) -> Path:
 
 
 def _is_read(target: Path, source: Path) -> bool:
-    """Whether an output is the input file itself, or one of the files of an input in the layout of OVAD."""
+    """Return whether an output is an input file, or a file of an input in the OVAD layout."""
     from worldstate.adapters.camera.video import VIDEO_NAME
     from worldstate.adapters.datasets import ovad
 

@@ -12,6 +12,9 @@ from worldstate.ground.extras import has_extra
 from .output import printable, say
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from worldstate import adapters, frontend, operations
     from worldstate.adapters.audio.sound_file import Audio
 
 Item = TypeVar("Item")
@@ -32,14 +35,14 @@ class Bar:
         self.shown(amount)
 
     def go_on(self, stage: str, amount: float) -> None:
-        """Say what is done from now on, and move the bar on by what was done before."""
+        """Name the next stage, and move the bar on by the amount of the last one."""
         self.stage = f": {stage}"
         self.advance(amount)
 
 
 @contextmanager
 def progress_bar(description: str, total: float | None, *, quiet: bool = False) -> Iterator[Bar]:
-    """Show on standard error how far the block is while it runs; nothing where `quiet`.
+    """Show the progress of a block on standard error; with `quiet` show nothing.
 
     Without a terminal, or without the package rich, it is a line every 30 seconds.
 
@@ -57,7 +60,7 @@ def progress_bar(description: str, total: float | None, *, quiet: bool = False) 
 
 
 def can_draw() -> bool:
-    """Return whether standard error is a terminal, and what draws there is installed."""
+    """Return whether standard error is a terminal and rich is installed."""
     return sys.stderr.isatty() and has_extra("rich")
 
 
@@ -100,15 +103,49 @@ def _told(description: str, bar: Bar) -> Iterator[None]:
 
 @contextmanager
 def sound_bar(audio: "Audio") -> Iterator[Bar]:
-    """Show a bar that counts the seconds of an open recording; how many a pipe has is not known."""
+    """Show a bar in seconds of an open recording; the length of a pipe is unknown."""
     known = audio.duration_s > 1.0
     with progress_bar(f"listening to {audio.path.name}", audio.duration_s if known else None) as bar:
         yield bar
 
 
 def track(items: Iterable[Item], description: str, total: float | None = None) -> Iterator[Item]:
-    """Yield the items, a step of a progress bar for each."""
+    """Yield the items and advance a progress bar by each."""
     with progress_bar(description, total) as bar:
         for item in items:
             yield item
             bar.advance()
+
+
+def listen_with_progress(
+    source: "adapters.Source",
+    *,
+    states_path: "Path | None",
+    on_hop: "Callable[[adapters.Step], None]" = lambda step: None,
+) -> "operations.RecordingReport":
+    """Run a recording to its end with a progress bar in seconds of sound."""
+    from worldstate import operations
+    from worldstate.adapters.audio.sound_file import RawPcm, open_sound
+
+    hops = None
+    if not isinstance(source.sound, RawPcm):
+        with open_sound(source.sound, channels=source.array.channels, strict=False) as audio:
+            hops = 10.0 * audio.duration_s
+    with progress_bar(f"listening to {source.audio_path.name}", hops) as bar:
+
+        def follow(step: "adapters.Step") -> None:
+            on_hop(step)
+            bar.advance()
+
+        return operations.run_recording(source, states_path=states_path, on_hop=follow)
+
+
+def read_streams(
+    inputs: "Iterable[Path]", array: "frontend.MicrophoneArray | None", model: "Path | None"
+) -> "list[operations.HopTable]":
+    """Return the hop streams of data sets, recordings, sound files and files of --save-streams."""
+    from worldstate.operations.calibration.cueing_calibration import find_inputs, read_input
+
+    found = [item for path in inputs for item in find_inputs(path)]
+    read = track(found, "listening", len(found))
+    return [stream for path in read for stream in read_input(path, array=array, model=model)]

@@ -1,1 +1,1 @@
-"""Commands that read what was logged."""
+"""Commands for the snapshots of a run."""

@@ -1,8 +1,7 @@
-"""`worldstate log plot`: figures of a run from its snapshots.
+"""`worldstate log plot`: draw a log over time, from above, or as an animation.
 
-Draw what the filter believed: over time (--out), from above at one time (--birds-eye with --time), and from
-above as an animation (--animate). With --recording the power of its sound lies below the azimuths, so that
-belief and sound are seen together.
+Draw the belief over time (--out), from above at one time (--birds-eye with --time), or as an animation from
+above (--animate). --recording adds the spatial power of the sound below the azimuths.
 
 Examples
 --------
@@ -23,11 +22,16 @@ from worldstate.ground.errors import InvalidArgumentError
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --out or --export mcap")
+    add("log", type=Path, metavar="LOG", help="log of `worldstate run`, by --out or --export mcap")
     add("--out", type=Path, metavar="PNG", help="draw the run over time")
-    add("--recording", type=Path, action="append", metavar="WAV", help="below --out its sound")
+    add("--recording", type=Path, action="append", metavar="WAV", help="sound of the run, for --out")
     add("--birds-eye", type=Path, metavar="PNG", help="draw the snapshot nearest to --time from above")
-    add("--time", type=float, metavar="S", help="seconds on the states' clock (default: the largest risk)")
+    add(
+        "--time",
+        type=float,
+        metavar="S",
+        help="seconds on the clock of the states (default: the largest risk)",
+    )
     add("--animate", type=Path, metavar="GIF", help="draw every snapshot from above")
     parser.set_defaults(topic=[])
     inputs.add_array_options(parser)
@@ -35,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.state_log import read_log
     from worldstate.operations.viewing import state_figure
 

@@ -1,7 +1,7 @@
-"""`worldstate log replay`: the snapshots of a log again, as they were written.
+"""`worldstate log replay`: send the snapshots of a log to a file, a viewer or another stack.
 
-Read the snapshots of an MCAP file, of a bag of ROS 2 or of JSON lines, and write or serve them anew. --out of
-an MCAP file or a bag that `worldstate run` wrote holds the same bytes as the --out of that run.
+Read the snapshots of an MCAP file, a bag of ROS 2 or JSON lines, and write or serve them again. For an MCAP
+file or a bag of `worldstate run`, --out is equal to the --out of that run, byte for byte.
 
 Examples
 --------
@@ -22,14 +22,14 @@ from worldstate.cli.common import exports, output, progress
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --export mcap, rosbag or --out")
+    add("log", type=Path, metavar="LOG", help="log of `worldstate run`, by --out or --export mcap or rosbag")
     exports.add_output_options(parser)
-    crossing = "metres ahead of the lane in which other stacks find what is only heard (default: 9)"
-    add("--crossing", type=float, default=exports.CROSSING_M, metavar="M", help=crossing)
+    crossing = "distance of the lane of vehicles without a known range, metres (default: 9)"
+    add("--crossing", type=float, default=9.0, metavar="M", help=crossing)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.files.file_io import line_writer
     from worldstate.adapters.state_log import read_log
     from worldstate.operations.recordings.recording_report import WarningMeter

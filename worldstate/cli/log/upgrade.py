@@ -1,9 +1,9 @@
-"""`worldstate log upgrade`: a log of an earlier version as this one writes it.
+"""`worldstate log upgrade`: convert a log of an earlier version.
 
-Snapshots of schema 3.x become snapshots of schema 4.2.0: every cue states whether it may be acted on, as far
-as the log holds why it may not. Commands, and `WorldState.from_json`, upgrade a log while they read it;
-programs in other languages need the file. An MCAP file of `--export` becomes one with its images and sound; a
-bag, whose other topics follow from its snapshots, becomes JSON lines.
+Convert snapshots of schema 3.x to schema 4.2.0, in which every cue states whether it is usable, as far as the
+log holds the reasons. Commands and `WorldState.from_json` convert a log as they read it; programs in other
+languages need the file. An MCAP file of `--export` keeps its images and sound; a bag becomes JSON lines,
+because its other topics follow from the snapshots.
 
 Examples
 --------
@@ -20,12 +20,14 @@ from worldstate.ground import InputFileError
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("log", type=Path, metavar="IN", help="what an earlier `worldstate run` wrote")
-    parser.add_argument("out", type=Path, metavar="OUT", help="the log to write: JSON lines, or MCAP of MCAP")
+    parser.add_argument("log", type=Path, metavar="IN", help="log of an earlier version")
+    parser.add_argument(
+        "out", type=Path, metavar="OUT", help="log to write: JSON lines, or MCAP for an MCAP log"
+    )
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.export.log_messages import SNAPSHOT_TOPIC, mcap_file
     from worldstate.adapters.files.file_io import line_writer
     from worldstate.adapters.state_log import is_own_mcap, read_log, upgraded_messages

@@ -1,9 +1,8 @@
-"""`worldstate log view`: a log as one page to step through in a browser.
+"""`worldstate log view`: write a log as one page for a browser.
 
-Write one HTML file that needs no other file and no network: the street from above, azimuths, what decides
-an advisory with its threshold, the evidence piece by piece, what was searched and heard, and the camera's
-images and the sound where LOG is an MCAP file that holds them. The arrow keys step from snapshot to snapshot,
-space plays, home and end go to the ends.
+Write one HTML file that needs no other file and no network: the street from above, azimuths, the log-odds of
+the alarm with its threshold, each term of the evidence, the searched views, and the images and sound of an
+MCAP log. The arrow keys step through the snapshots, space plays, home and end go to the ends.
 
 Examples
 --------
@@ -27,13 +26,19 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="what `worldstate run` wrote by --out or --export mcap")
-    add("--out", type=Path, metavar="HTML", help="the page (default: LOG with .html in place of its ending)")
-    add("--between", type=float, nargs=2, metavar="S", help="from when to when, seconds on the states' clock")
+    add("log", type=Path, metavar="LOG", help="log of `worldstate run`, by --out or --export mcap")
+    add("--out", type=Path, metavar="HTML", help="page to write (default: LOG with the suffix .html)")
+    add(
+        "--between",
+        type=float,
+        nargs=2,
+        metavar="S",
+        help="first and last time, seconds on the clock of the states",
+    )
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.state_log import read_media
     from worldstate.operations.viewing.log_page import check_page, page_data, write_log_page
 
@@ -48,7 +53,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _between(log: Path, span_s: Sequence[float], advance: Callable[[], None]) -> "Iterator[WorldState]":
-    """Yield the snapshots of this time; refuse a time without any."""
+    """Yield the snapshots within a span; refuse a span without any."""
     from worldstate.adapters.state_log import read_log
 
     first_ns, last_ns = map(ground.nanoseconds, span_s)

@@ -1,15 +1,15 @@
-r"""`worldstate model detector`: the miss rate of a camera's detector on staged-degraded frames.
+r"""`worldstate model detector`: measure the miss rates of a detector on degraded images.
 
-Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation:
-blur, darkness, sensor noise and the three together are staged on clean video, four levels each, and a
-detector has to find the reference boxes again (IoU >= 0.3). False detections are counted apart, as clutter.
+Measure beta(theta, d), the probability that a visible road user is missed, over azimuth and degradation.
+Blur, darkness, sensor noise and all three together are applied to clean video in four levels each, and a
+detection must overlap a reference box (IoU >= 0.3). False detections are counted apart, as clutter.
 
 INPUT is a video, or a data set or recording folder in the OVAD layout with ueye_stereo_vid.mp4 beside the
-sound. Its detections are the reference; for a video give --reference: OVAD's or COCO's JSON, MOTChallenge
-text or a folder of YOLO text. Without any, what the detector itself reports on clean frames is the
-reference, and its miss rate on those is zero by definition.
+sound, whose detections are the reference. For a video, --reference takes OVAD's or COCO's JSON, MOTChallenge
+text or a folder of YOLO text. Without a reference the detector's own boxes on clean images are used, so that
+its miss rate on these is zero.
 
-The file also holds the scale by which d is read from this camera's own images.
+The file also holds the scale that converts images of this camera to d.
 
 Examples
 --------
@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate import adapters, ground, operations
-from worldstate.cli.common import output, progress, sensors
+from worldstate.adapters import own_parts
+from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -34,18 +35,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("input", type=Path, metavar="INPUT", help="video, recording folder or data set")
-    add("--reference", type=Path, metavar="PATH", help="boxes that are there (for a video)")
-    sensors.add_detector_option(parser)
+    add("--reference", type=Path, metavar="PATH", help="true boxes of a video")
+    inputs.add_detector_option(parser)
     add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of an ONNX model")
     add("--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)")
     add("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
-    add("--seed", type=int, default=0, help="draws the staged noise (default: %(default)s)")
-    add("--out", type=Path, required=True, metavar="JSON", help="exactly this file")
+    add("--seed", type=int, default=0, help="seed of the noise (default: %(default)s)")
+    add("--out", type=Path, required=True, metavar="JSON", help="file to write")
     add("--figure", type=Path, metavar="PNG", help="draw beta over d")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     import numpy as np
 
     from worldstate.operations.detectors.miss_rate_measurement import find_videos, write_absence_figure
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     output.check_outputs(arguments, "out", figures=("figure",))
     if arguments.most is not None:
         ground.in_range("--most", arguments.most, 1, np.inf)
-    make = sensors.detector_maker(arguments.detector, tuple(arguments.labels))
+    make = own_parts.detector_maker(arguments.detector, tuple(arguments.labels))
     videos = find_videos(arguments.input, arguments.most)
     if arguments.reference is not None and len(videos) > 1:
         raise InvalidArgumentError(f"--reference: expected one video with it, got {len(videos)}")
@@ -92,7 +93,7 @@ def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
     return {
         "data": arguments.input.name,
         "videos": str(videos),
-        "detector": sensors.detector_name(arguments.detector),
+        "detector": own_parts.detector_name(arguments.detector),
         "seed": str(arguments.seed),
         "worldstate": __version__,
     }

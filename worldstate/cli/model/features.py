@@ -1,14 +1,13 @@
-"""`worldstate model features`: labelled recordings in, a table of feature windows out.
+"""`worldstate model features`: compute feature windows of labelled recordings.
 
-Compute the published 60-value feature of labelled one-second windows, so that a model can be trained for an
-array of one's own. The list of labels is CSV with the columns ID, Class (front, left, none, right),
-Environment (S.. standing ego, D.. moving ego, then the junction) and Recording ID; optional are File,
+Compute the published feature of 60 values for labelled one-second windows, to train a model for your own
+array. The list of labels is a CSV file with the columns ID, Class (front, left, none, right), Environment
+(S.. for a standing ego, D.. for a moving one, then the junction) and Recording ID. Optional columns are File,
 relative to DATASET, End, the end of the window in seconds from the start of the file (default: its last
-second), and T0. Where no File is given, DATASET/Environment/Class/ID/out_multi.wav and DATASET/ID.wav are
-looked for.
+second), and T0. Without File, the sound is DATASET/Environment/Class/ID/out_multi.wav or DATASET/ID.wav.
 
-Without --labels, DATASET is in the OVAD layout and DataLog.csv says what is in it: windows of left, right and
-none end at T0, 0.5 s later where the ego moves, front windows 1.5 s after that.
+Without --labels, DATASET has the OVAD layout with DataLog.csv: windows of left, right and none end at T0, for
+a moving ego 0.5 s later, and front windows 1.5 s after that.
 
 Examples
 --------
@@ -31,14 +30,14 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder that files are relative to")
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the recordings")
     parser.add_argument("--labels", type=Path, metavar="CSV", help="list of windows (default: see above)")
-    parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="exactly this file")
+    parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="file to write")
     inputs.add_array_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     import numpy as np
 
     from worldstate.adapters.datasets.feature_extraction import feature_table

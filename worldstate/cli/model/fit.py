@@ -1,13 +1,13 @@
-"""`worldstate model fit`: a table of feature windows in, a model file out.
+"""`worldstate model fit`: fit a model to a table of feature windows.
 
 Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
-scores of windows that it was not trained on. The model file is JSON: coefficients, no rows of the data, and
-what the windows were made with: array, sample rate, band, ego's motion. A table that does not say, as the
-released one, counts as OVAD's unless --array and --sample-rate say otherwise.
+out-of-fold scores. The model file is JSON with the coefficients and the origin of the windows: array, sample
+rate, band and ego motion. It holds no row of the data. A table without these is taken as OVAD's, unless
+--array and --sample-rate state others.
 
-The classifier is a mirror-symmetric ensemble on windows compared with their site, for unseen junctions, its
-thresholds half-way between recordings left out and junctions left out. With --simulated it learns simulated
-windows too, with --streams the classes both and direct as well: for a standing ego.
+The classifier is a mirror-symmetric ensemble on windows relative to their site, for unseen junctions. Its
+thresholds are half-way between left-out recordings and left-out junctions. --simulated adds simulated windows
+to the training, and --streams also the classes both and direct, for a standing ego.
 
 Examples
 --------
@@ -33,26 +33,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add_table_options(parser)
-    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    written = "what `label --windows` writes"
-    labels = f"windows of recordings of one's own, learned as those of the table: {written}"
+    add("--out", type=Path, required=True, metavar="MODEL", help="file to write")
+    labels = "windows of your own recordings for training, as `street label --windows` writes them"
     add("--labels", type=Path, nargs="+", default=[], metavar="CSV", help=labels)
-    ids = "CSV files with a column ID: leave out the recordings of these windows"
+    ids = "CSV files with a column ID: recordings to leave out"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
-    add("--array", type=Path, metavar="FILE", help="microphones that the windows were heard by")
-    add("--sample-rate", type=float, metavar="HZ", help="of that sound (default: 47998)")
+    add("--array", type=Path, metavar="FILE", help="array of the windows")
+    add("--sample-rate", type=float, metavar="HZ", help="sample rate of the windows (default: 47998)")
     add("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
     add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
-    add("--seed", type=int, default=0, help="draws the folds (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the folds (default: %(default)s)")
 
 
 def add_table_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the table, which part of it counts and what is made of it."""
+    """Declare the table, its group and the simulated windows."""
     parser.add_argument("table", type=Path, metavar="CSV", help="windows: feat0..feat59, Class, ID, ...")
     add_group(parser, "standing ego, moving ego or both")
-    simulated = "simulated windows of the same sites, learned too: what `realism --out` writes"
+    simulated = "simulated windows of the same sites for training, as `realism --out` writes them"
     parser.add_argument("--simulated", type=Path, nargs="+", metavar="CSV", help=simulated)
-    streams = "simulated streams that were listened to: windows of them, and of sources in the open, too"
+    streams = "processed simulated streams; windows of them and of sources in the open are trained on"
     parser.add_argument("--streams", type=Path, nargs="+", metavar="NPZ", help=streams)
 
 
@@ -62,7 +61,7 @@ def add_group(parser: argparse.ArgumentParser, of: str) -> None:
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.datasets.feature_table import read_ids
 
     output.check_outputs(arguments, "out")
@@ -97,7 +96,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def read_beside(arguments: argparse.Namespace, table: "adapters.FeatureTable") -> "SimulatedWindows | None":
-    """Return the simulated windows that are to be learned beside a table, None without any."""
+    """Return the simulated windows for training beside a table, None without any."""
     import numpy as np
 
     from worldstate.commissioning import heard_stream, simulated_windows
@@ -116,13 +115,13 @@ def read_beside(arguments: argparse.Namespace, table: "adapters.FeatureTable") -
 
 
 def _array_of(table: "adapters.FeatureTable") -> "frontend.MicrophoneArray":
-    # A table that does not say, as the released one, is OVAD's.
+    # A table without a domain, such as the released one, is OVAD's.
     domain = table.domain
     return frontend.ovad_array() if domain is None else frontend.MicrophoneArray(domain.positions_m)
 
 
 def _heard_windows(labels: Path, table: "adapters.FeatureTable") -> "adapters.FeatureTable":
-    """Return the features of labelled windows, by the microphones that the table's were heard by."""
+    """Return the features of labelled windows, for the array of the table."""
     from worldstate.adapters.datasets.feature_extraction import feature_table, read_labels
 
     array = _array_of(table)
@@ -132,7 +131,7 @@ def _heard_windows(labels: Path, table: "adapters.FeatureTable") -> "adapters.Fe
 
 
 def _with_domain(arguments: argparse.Namespace, table: "adapters.FeatureTable") -> "adapters.FeatureTable":
-    """Return the table with what its windows were made with: as it says, as the options say, or as OVAD's."""
+    """Return the table with its domain: its own, that of the options, or OVAD's."""
     from dataclasses import replace
 
     from worldstate.adapters.files.acoustic_domain import check_array, domain_of, ovad_domain
@@ -141,7 +140,7 @@ def _with_domain(arguments: argparse.Namespace, table: "adapters.FeatureTable") 
     environments = table.environments.tolist()
     if arguments.array is None:
         if table.domain is None:
-            output.say(f"{arguments.table} names no array: taken as OVAD's")
+            output.say(f"{arguments.table} states no array: taken as OVAD's")
         return replace(table, domain=table.domain or ovad_domain(environments))
     array = adapters.read_array(arguments.array)
     if table.domain is not None:

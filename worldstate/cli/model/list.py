@@ -1,7 +1,7 @@
-"""`worldstate model list`: the models that ship.
+"""`worldstate model list`: list the shipped models.
 
-Print array, microphones, spacing, the ego's motion, and what each was made of. The first two are those of the
-roof array. One for a board is found by the board's --array; --model takes the name of any but the first two.
+Print array, microphones, spacing, ego motion and training data of each model. The first two are those of the
+roof array, selected by the ego motion. --array NAME selects the model of a board, and --model takes a name.
 
 Examples
 --------
@@ -24,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.adapters.files.array_file import shipped_models
 
     models = {name: adapters.read_model(moving_ego=name == "moving") for name in ("standing", "moving")}

@@ -1,18 +1,18 @@
-"""`worldstate model make`: an array in, a model for it and what to expect of it out.
+"""`worldstate model make`: make a model for an array, with its expected performance.
 
-Simulate streets for an array, listen to them, learn what a window and what three seconds of windows say, set
-the alarm to what hazard-free streets allow, and examine all of it on five other junctions: approaches
-detected, lead, alarms an hour, both sides, times to visible. Usable before any microphone is bought.
+Simulate streets for an array, train the window model and the sequence model (three seconds of windows), set
+the alarm on hazard-free streets, and examine the result on five other junctions: detected approaches, lead,
+false alarms per hour, both sides, times to visible. The array need not exist yet.
 
---sounds FOLDER --kinds TABLE learns kinds of road users and the guard from clips of your own, too. TABLE is a
-CSV file with the columns file (below FOLDER), kind, recording and, optionally, road_user: car, van, truck,
-tram, motorcycle or bicycle. Every recording counts as much as a simulated clip. Any kind but siren, horn,
-reversing beeper, bicycle bell (warning signals) and street is a foreign sound. The model says that it was
-learned so.
+--sounds FOLDER --kinds TABLE adds clips of your own to the training of the road-user classifier and the
+guard. TABLE is a CSV file with the columns file (below FOLDER), kind, recording and, optionally, road_user:
+car, van, truck, tram, motorcycle or bicycle. Each recording has the weight of one simulated clip. Every kind
+except the warning signals (siren, horn, reversing beeper, bicycle bell) and street is a foreign sound. The
+card of the model states such clips.
 
-With several --array every street is rendered once for all of them; --out is then a folder, with NAME.json.gz
-of each. Streams that were listened to are kept in --streams and not rendered again: what was interrupted goes
-on there. --quick learns from minutes instead of hours; its model is marked as unfit for use.
+With several --array each street is rendered once for all of them, and --out is a folder with NAME.json.gz for
+each. --streams keeps the processed streams, and an interrupted run continues from them. --quick trains on
+minutes instead of hours, and its model is marked as unfit for use.
 
 Examples
 --------
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from worldstate.commissioning.heard_stream import CommissionSettings
     from worldstate.commissioning.recorded_clips import RecordedClips
 
-# Alarms an hour by what the ego does: its own noise leaves less to be heard of others.
+# False alarms per hour by ego motion, because a moving ego is louder itself.
 ONSETS = {"standing": 30.0, "moving": 60.0}
 
 NEEDS = ("sklearn",)
@@ -49,45 +49,55 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     inputs.add_array_options(parser, "OVAD's; repeated, a model for each", "append")
-    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file; of several a folder")
-    add("--report", type=Path, metavar="JSON", help="write what the exam found")
-    add("--figure", type=Path, metavar="PNG", help="draw what the exam found")
-    streams = "keep streams that were listened to, and take those that are there (default: beside MODEL)"
+    add("--out", type=Path, required=True, metavar="MODEL", help="file to write; a folder for several arrays")
+    add("--report", type=Path, metavar="JSON", help="write the results of the exam")
+    add("--figure", type=Path, metavar="PNG", help="draw the results of the exam")
+    streams = "folder of processed streams, which are reused (default: beside MODEL)"
     add("--streams", type=Path, metavar="DIR", help=streams)
-    windows = "labelled windows of this array at real junctions, learned too: feat0..feat59, Class, ..."
+    windows = "labelled windows of this array at real junctions for training: feat0..feat59, Class, ..."
     add("--labelled", type=Path, metavar="CSV", help=windows)
-    ids = "CSV files with a column ID: leave out the recordings of these labelled windows"
+    ids = "CSV files with a column ID: recordings to leave out of the labelled windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
     licence = "licence of the labelled windows, for the card (default: none stated)"
     add("--licence", default="none stated", metavar="TEXT", help=licence)
-    quiet = "recordings without a vehicle: the alarm is set on them"
+    quiet = "recordings without a vehicle, to set the alarm"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
-    add("--sounds", type=Path, metavar="FOLDER", help="clips of your own, which --kinds lists")
-    add("--kinds", type=Path, metavar="TABLE", help="file, kind and more of each of --sounds")
+    add("--sounds", type=Path, metavar="FOLDER", help="folder of your own clips")
+    add("--kinds", type=Path, metavar="TABLE", help="list of the clips in --sounds")
     command.add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
-    allowed = "alarms an hour allowed (default: 30, of a moving ego 60)"
+    allowed = "allowed false alarms per hour (default: 30, for a moving ego 60)"
     add("--onsets", type=float, metavar="N", help=allowed)
     add(
-        "--junctions", type=int, default=12, metavar="N", help="to learn from, of each renderer (default: 12)"
+        "--junctions",
+        type=int,
+        default=12,
+        metavar="N",
+        help="junctions for training, per renderer (default: 12)",
     )
-    minutes = "of approaches at each; all other streams and the exam last in proportion (default: 7.2)"
+    minutes = "minutes of approaches per junction; other streams and the exam in proportion (default: 7.2)"
     add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
-    add("--leave-out", nargs="+", default=[], metavar="SITE", help="real junctions never to be learned from")
-    add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine it (default: on)")
-    wrong = "hear one junction of the exam with a turned array and with wrong positions, too"
+    add(
+        "--leave-out",
+        nargs="+",
+        default=[],
+        metavar="SITE",
+        help="real junctions to leave out of the training",
+    )
+    add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine the model (default: on)")
+    wrong = "examine one junction with a rotated array and with wrong positions as well"
     add("--mounting-errors", action="store_true", help=wrong)
-    quick = "from minutes of sound: to try the command, not to use the model"
+    quick = "train on minutes of sound, to try the command; the model is unfit for use"
     add("--quick", action="store_true", help=quick)
-    add("--seed", type=int, default=1, help="another seed, other streams (default: 1)")
-    add("--jobs", type=int, default=1, help="processes (default: 1)")
+    add("--seed", type=int, default=1, help="seed of the streams (default: 1)")
+    add("--jobs", type=int, default=1, help="number of processes (default: 1)")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.commissioning import stream_exam
 
-    arrays = [adapters.read_array(one, arguments.array_axes) for one in arguments.array or ()]
+    arrays = [adapters.read_array(one) for one in arguments.array or ()]
     outs = _outs(arguments, arrays)
     output.check_outputs(arguments, *(() if len(arrays) > 1 else ("out",)), "report", figures=("figure",))
     command.check_beside(arguments, exclude="labelled", source="labelled", figure="exam")
@@ -99,7 +109,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     report: dict[str, object] = {"models": reports} if len(arrays) > 1 else next(iter(reports.values()))
     told = {name: one for name, one in report.items() if name != "real_figures"}
     told = {"out": str(arguments.out)} if len(arrays) > 1 else told
-    # The figures of the 56 microphones are those of a standing ego.
+    # The figures of the 56 microphones apply to a standing ego.
     if not settings.moving_ego:
         reference = adapters.read_model().provenance.exam
         told, report["reference"] = stream_exam.beside_reference(told, reference), dict(reference)
@@ -113,7 +123,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _outs(arguments: argparse.Namespace, arrays: "list[frontend.MicrophoneArray]") -> list[Path]:
-    """Return the file of the model of each array; of several they stand in the folder --out."""
+    """Return the model file of each array; for several arrays in the folder --out."""
     if len(arrays) <= 1:
         return [arguments.out]
     for option in ("labelled", "quiet", "figure", "mounting_errors"):
@@ -180,7 +190,7 @@ def _made(
 
 
 def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":
-    """Return the labelled windows that are learned, too; None without any."""
+    """Return the labelled windows for training; None without any."""
     from worldstate.adapters.datasets.feature_table import Group, read_ids
 
     if arguments.labelled is None:
@@ -191,7 +201,7 @@ def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":
 
 
 def _recorded(arguments: argparse.Namespace) -> "RecordedClips | None":
-    """Hear the clips that are learned, too; None without any."""
+    """Process the clips for training; None without any."""
     from worldstate.adapters.files.file_io import read_rows
     from worldstate.commissioning.recorded_clips import read_recorded
 

@@ -1,12 +1,12 @@
-"""`worldstate model show`: the card of a model file.
+"""`worldstate model show`: print the card of a model.
 
-Say what a model was made of and made for: data, recordings, array, band, feature, ego's motion,
-thresholds, limits, licence.
+Print the origin and the domain of a model: data, recordings, array, band, feature, ego motion, thresholds,
+limits and licence.
 
 Examples
 --------
-  worldstate model
-  worldstate model my_model.json --json
+  worldstate model show
+  worldstate model show my_model.json --json
 """
 
 import argparse
@@ -17,11 +17,11 @@ from worldstate import adapters
 from worldstate.cli.common import output
 from worldstate.frontend.array.microphone_array import nearest_spacings_m
 
-# Of the coefficients that ship; the data that a user trains on has a licence of its own.
+# The training data of a user has a licence of its own.
 LICENCE = "Apache-2.0 for the coefficients that ship; no row of the training data is in the file"
-SHOWN = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0)  # Onsets an hour that may be asked for
+SHOWN = (3.0, 6.0, 12.0, 25.0, 50.0, 100.0)  # Budgets, false alarms per hour
 UNNAMED = "names no array, sample rate or ego motion: no budget is stated with it"
-# How a row of these reads.
+# Text of each row of the card.
 _ROWS = {
     "sources": "{name}: {use}; licence: {licence}",
     "real_figures": "{sentence}",
@@ -33,20 +33,28 @@ _ROWS = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("file", type=Path, nargs="?", metavar="FILE", help="model file (default: the one that ships)")
+    add(
+        "file",
+        type=Path,
+        nargs="?",
+        metavar="FILE",
+        help="model file, or the name of a shipped model (default: the first one)",
+    )
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
+    from worldstate.adapters.source import NO_STREET
+
     model = adapters.read_model(arguments.file)
     if model.street is None:
-        output.say(output.NO_STREET)
+        output.say(NO_STREET)
     card = model_card(model)
     return output.CommandResult(card, table=readable(card))
 
 
 def readable(card: dict[str, object]) -> dict[str, object]:
-    """Return the card with one line a threshold and a limit."""
+    """Return the card with one line per threshold and limit."""
     lines: dict[str, object] = {}
     for key, value in card.items():
         if isinstance(value, dict) and key == "street":
@@ -117,7 +125,7 @@ def _made_for(model: "adapters.Model") -> dict[str, object]:
 
 
 def _budgets(model: "adapters.Model") -> dict[str, object]:
-    """Return what the curve promises at the budget that is taken if none is asked for, and at some others."""
+    """Return the row of the curve for the default budget, and for some others."""
     sequence = model.sequence
     if sequence is None or sequence.alarm is None:
         return {}
@@ -131,7 +139,7 @@ def _budgets(model: "adapters.Model") -> dict[str, object]:
 
 
 def _limits(model: "adapters.Model") -> list[str]:
-    """Say what the model was not made for."""
+    """Return the limits of the model."""
     from worldstate.adapters.files.acoustic_domain import UNFIT
     from worldstate.frontend.direction.feature import LEAST_RATE_HZ
 

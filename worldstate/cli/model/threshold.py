@@ -1,15 +1,15 @@
-"""`worldstate model threshold`: thresholds of a model from a user's own hazard-free hours.
+"""`worldstate model threshold`: set the thresholds of a model on your own hazard-free hours.
 
-Set the thresholds gamma(alpha) of a model on hazard-free sound of your own, and keep its signature as it is.
+Set the thresholds gamma(alpha) of a model on your own hazard-free sound; its signature does not change.
 
-INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, hop streams
-that --save-streams wrote with the same signature, or the folder that `hear --hops` wrote. Recordings
-labelled none, sound files and the recordings of `hear` count as hazard-free. Approaches with a T0, where
-there are some, give the risk map (Platt for few, isotonic for many); without them the model's own is kept.
-If few false alarms were counted, a warning names the hours that would count enough.
+INPUT is a data set in the OVAD layout, the folder of one recording, a multichannel sound file, hop streams of
+--save-streams with the same signature, or a folder of `hear --hops`. Recordings labelled none, sound files
+and recordings of `hear` are taken as hazard-free. Approaches with a T0 give the risk map (Platt for few,
+isotonic for many); without them the model keeps its own. With few false alarms a warning states the hours
+that would be enough.
 
-Of what `hear` wrote, the curve from a budget of onsets an hour to the threshold of a model with a sequence
-is measured as well, and --budget chooses the one that is taken if none is asked for.
+For a folder of `hear` and a model with a sequence, the curve from false alarms per hour to the threshold is
+measured as well, and --budget sets its default.
 
 Examples
 --------
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate import adapters, operations
-from worldstate.cli.common import inputs, listening, output
+from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -37,18 +37,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("inputs", type=Path, nargs="+", metavar="INPUT", help="data set, recordings, sound")
     inputs.add_array_options(parser)
-    add("--model", type=Path, help="model file to start from (default: the one that ships)")
-    add("--out", type=Path, required=True, metavar="MODEL", help="exactly this file")
-    budgets = "budgets: share of hazard-free windows in alarm (default: 0.01 0.02 0.05)"
+    add("--model", type=Path, help="model to start from (default: the shipped one)")
+    add("--out", type=Path, required=True, metavar="MODEL", help="file to write")
+    budgets = "shares of hazard-free windows in alarm (default: 0.01 0.02 0.05)"
     add("--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A", help=budgets)
-    own = "onsets an hour that the alarm is set to, of a corpus (default: the model's own)"
+    own = "default false alarms per hour, for a corpus (default: the model's)"
     add("--budget", type=float, metavar="ONSETS", help=own)
     add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
-    add("--save-streams", type=Path, metavar="NPZ", help="keep what was heard for next time")
+    add("--save-streams", type=Path, metavar="NPZ", help="save the processed streams for a later run")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from dataclasses import replace
 
     from worldstate.operations.recordings.hop_table import save_tables
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     )
     array = inputs.given_array(arguments)
     model = adapters.read_model(arguments.model, array=array)
-    streams = listening.read_streams(arguments.inputs, array, arguments.model)
+    streams = progress.read_streams(arguments.inputs, array, arguments.model)
     if arguments.save_streams is not None:
         save_tables(arguments.save_streams, streams)
     done = operations.calibrate_cueing(streams, model.signature.reference_prior, model.policies, settings)
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 def _with_curve(
     model: "adapters.Model", streams: "Sequence[operations.HopTable]", budget: float | None
 ) -> "adapters.Model":
-    """Return a model with the curve that is measured on a corpus; one without a sequence as it is."""
+    """Return a model with the curve of a corpus; a model without a sequence is unchanged."""
     import numpy as np
 
     from worldstate.commissioning.alarm_curve import check_hours, measured_curve

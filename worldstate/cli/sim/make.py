@@ -1,32 +1,31 @@
-"""`worldstate sim make`: blind-junction recordings in the OVAD layout.
+"""`worldstate sim make`: simulate recordings of blind junctions in the OVAD layout.
 
-Simulate recordings of a vehicle with a roof array at blind junctions, in the OVAD layout: D/DataLog.csv and
-D/<environment>/<class>/<ID>/ with out_multi.wav, camera_baseline_results.json and truth.json: ways, line of
-sight and time to visible of every vehicle. D/array.xml names the microphones. The ego stands (--static, SA1
-to SB3) or drives up to the corner and is heard on its own roof (--dynamic, DA1 to DB3; no camera results
-there, as in OVAD). Every other recording is an approach, from the left and from the right in turn; the others
-are hazard-free.
-The same seed gives the same bytes, whatever the number of jobs. --video adds what the camera sees,
-ueye_stereo_vid.mp4 at the size of OVAD's camera, from the extra `vision`; sound and boxes stay the same.
+Simulate recordings of a vehicle with a roof array at blind junctions: D/DataLog.csv, D/array.xml with the
+microphones, and D/<environment>/<class>/<ID>/ with out_multi.wav, camera_baseline_results.json and truth.json
+(path, line of sight and time to visible of each vehicle). The ego stands (--static, SA1 to SB3) or approaches
+the corner with its own noise (--dynamic, DA1 to DB3, without camera results as in OVAD). Every other
+recording is an approach, alternately from the left and from the right; the others are hazard-free. One seed
+gives the same bytes for any number of processes. --video adds the camera's video, ueye_stereo_vid.mp4 in the
+size of OVAD's camera (extra `vision`); sound and boxes do not change.
 
---sounds adds what is no vehicle at a drawn place, in every recording: people, bells, tools, music, birds,
-rain that may soil the lens, gusts. Sirens, horns and beepers are the vehicle's where there is one, and come
-from another street where there is none. In the list a folder stands for recordings of your own: it holds a
-folder a kind, named as the kind, with WAV or FLAC files. These kinds sound, and stretches of the files take
-the place of their synthesis, mono and at the level of the kind.
+--sounds adds sources that are not vehicles, at a drawn place in every recording: people, bells, tools, music,
+birds, rain that may soil the lens, gusts. Sirens, horns and beepers belong to the vehicle, or to another
+street if there is none. A folder in the list holds recordings of your own, one folder of WAV or FLAC files
+per kind: excerpts of the files replace the synthesis, mono and at the level of the kind.
 
---scene is another place, where the ego stands: a van ahead, piers at a ramp, a wall that ends at a merge, an
-open road, a wide crossing, a house on one side only, a parked van; "all" is every place and junction in turn.
-Half of their hazard-free recordings have a vehicle in plain view, or one that is never in view.
+--scene places a standing ego elsewhere: behind a van, between piers at a ramp, at a wall before a merge, on
+an open road, at a wide crossing, beside a house on one side only, behind a parked van; "all" alternates all
+places and junctions. Half of their hazard-free recordings have a vehicle in plain view, or one that never
+comes into view.
 
---bandwidth 2000 renders at 6 kHz, eight times fewer samples: the 60 values and the bearings need no more,
-and every command that listens takes frames that fit the rate of the file. Left out is all sound above.
+--bandwidth 2000 renders at 6 kHz, an eighth of the samples, which is enough for the feature and the bearings;
+sound above the limit is missing.
 
 --minutes M simulates one continuous stream at --site instead, with traffic as arrivals: D/<name>/ with the
-sound, array.xml, camera results, truth.json, events.json (an entry a vehicle), vehicles.csv (a row a vehicle
-and tenth of a second: position, speed, in view, time to visible, loudness at the array) and stream.png.
---traffic no-hazard is busy, but nothing comes out of a hidden arm: whatever warns there is wrong.
---sounds come twelve times an hour each; a tenth of the vehicles has each signal of them.
+sound, array.xml, camera results, truth.json, events.json (one entry per vehicle), vehicles.csv (one row per
+vehicle and 0.1 s: position, speed, in view, time to visible, loudness at the array) and stream.png. With
+--traffic no-hazard no vehicle comes out of a hidden arm, so that every alarm is false. Each kind of --sounds
+occurs twelve times per hour, and each signal at a tenth of the vehicles.
 
 Examples
 --------
@@ -49,15 +48,15 @@ from worldstate.ground.extras import check_extra
 if TYPE_CHECKING:
     from worldstate.simulation.stream.settings import StreamSettings
 
-JUNCTION = "junction"  # the scene where none is named
-# Of recordings alone, with what each is where it is not given.
+JUNCTION = "junction"  # The default scene
+# Options of recordings, not of streams, with their defaults.
 OF_RECORDINGS = {
     **{"static": None, "dynamic": 0, "video": False, "duration": None},
     **{"scene": JUNCTION, "kind": next(iter(simulation.KINDS))},
 }
 FIGURE_NAME = "stream.png"
-PER_HOUR = 12.0  # of every kind of --sounds in a stream that is no vehicle's
-SIGNAL_SHARE = 0.1  # of the vehicles have each signal of --sounds
+PER_HOUR = 12.0  # Occurrences of each kind of --sounds in a stream
+SIGNAL_SHARE = 0.1  # Share of the vehicles with each signal of --sounds
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -66,31 +65,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="D", help="folder of the data set")
-    add("--static", type=int, metavar="N", help="recordings of a standing ego (default: 4, 0 with --dynamic)")
-    add("--dynamic", type=int, default=0, metavar="N", help="of a moving one (default: 0)")
+    add(
+        "--static",
+        type=int,
+        metavar="N",
+        help="recordings with a standing ego (default: 4, 0 with --dynamic)",
+    )
+    add("--dynamic", type=int, default=0, metavar="N", help="recordings with a moving ego (default: 0)")
     command.add_choice(parser, "--scene", "what hides the vehicle", JUNCTION, *simulation.PLACES, "all")
     command.add_choice(parser, "--kind", "vehicle", *simulation.KINDS)
     command.add_choice(parser, "--preset", "how busy the street is", *simulation.PRESETS)
-    told = f"what else sounds, separated by commas: {', '.join(simulation.SOUNDS)}; or a folder of recordings"
+    told = f"other sources, separated by commas: {', '.join(simulation.SOUNDS)}; or a folder of recordings"
     add("--sounds", type=_words, default=(), metavar="KINDS|FOLDER", help=told)
     inputs.add_array_options(parser, "OVAD's")
-    add("--seed", type=int, default=1, help="another seed, another data set (default: 1)")
-    add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--duration", type=float, help="seconds each (default: 10)")
-    told = "render up to here only, 700 to 16,000 (default), at three to six times as many samples a second"
+    add("--seed", type=int, default=1, help="seed of the data set (default: 1)")
+    add("--jobs", type=int, default=1, help="number of processes (default: 1)")
+    add("--duration", type=float, help="length of a recording, seconds (default: 10)")
+    told = "highest frequency, 700 to 16,000 (default); the sample rate is three to six times as high"
     add("--bandwidth", type=float, metavar="HZ", help=told)
-    add("--video", action="store_true", help="render the camera's video, too")
-    add("--video-width", type=int, metavar="PX", help="of its images (default: 1936)")
+    add("--video", action="store_true", help="render the video of the camera as well")
+    add("--video-width", type=int, metavar="PX", help="width of the images (default: 1936)")
     add = parser.add_argument_group("a continuous stream").add_argument
-    add("--minutes", type=float, metavar="M", help="its length")
-    # Any word is taken: the library refuses a moving ego with its reason.
+    add("--minutes", type=float, metavar="M", help="length of the stream")
+    # No choices: the library refuses a moving ego with the reason.
     sites = simulation.SITES
     add("--site", help=f"{', '.join(sites)}, or TA1, MB7, ... of the other renderers (default: {sites[0]})")
-    add("--traffic", choices=[*TRAFFICS], help="how much drives (default: calm)")
+    add("--traffic", choices=[*TRAFFICS], help="density of the traffic (default: calm)")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     command.check_beside(arguments, site="minutes", traffic="minutes", video_width="video")
     if arguments.minutes is not None:
         return _run_stream(arguments)
@@ -116,7 +120,9 @@ def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
 
     given = [f"--{name}" for name, usual in OF_RECORDINGS.items() if getattr(arguments, name) != usual]
     if given:
-        raise InvalidArgumentError(f"--minutes: expected without {', '.join(given)}, which are of recordings")
+        raise InvalidArgumentError(
+            f"--minutes: expected without {', '.join(given)}, which apply to recordings only"
+        )
     check_extra("matplotlib")
     arguments.traffic = arguments.traffic or "calm"
     settings = _stream_settings(arguments)
@@ -180,7 +186,7 @@ def _settings(arguments: argparse.Namespace) -> "simulation.DatasetSettings":
 
 
 def _sounds(words: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
-    """Return the kinds that sound, and the folder with recordings of some of them; empty without one."""
+    """Return the kinds of sources, and the folder with recordings of some of them; empty without one."""
     from worldstate.simulation.emitters.emitter import recorded_kinds
 
     folders = [word for word in words if word not in simulation.SOUNDS and Path(word).is_dir()]

@@ -1,8 +1,8 @@
-"""`worldstate sim to-bag`: a recording as a bag of ROS 2, as a vehicle would have recorded it.
+"""`worldstate sim to-bag`: convert a recording to a bag of ROS 2.
 
-Write sound, array, detections, where both stand in base_link and the speed of the ego, where it is known, as
-messages. It shows what a bag has to look like for `worldstate run BAG`, and which topics; the definitions are
-in the documentation.
+Write sound, array, detections, the poses of both in base_link and, if known, the speed of the ego as
+messages. The bag shows the topics and types that `worldstate run BAG` reads; the documentation has the
+definitions.
 
 Examples
 --------
@@ -21,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("recording", type=Path, metavar="RECORDING", help="folder of a recording in the OVAD layout")
-    add("out", type=Path, metavar="BAG", help="folder to write, which must not exist")
+    add("out", type=Path, metavar="BAG", help="folder to write; it must not exist")
     start = "time of the first sample, seconds since 1970 in a real bag (default: %(default)g)"
     add("--start", type=float, default=0.0, metavar="S", help=start)
     command.add_choice(parser, "--ros-storage", "storage of the bag that is written", "mcap", "sqlite3")
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it wrote."""
+    """Run the command; return its result."""
     from worldstate.adapters.datasets.ovad import choose_array
     from worldstate.adapters.ros.bag_writer import check_bag_target, odometry_of, write_bag
 

@@ -1,16 +1,16 @@
-"""`worldstate street label`: a recording with a camera in, trajectories and labelled windows out.
+"""`worldstate street label`: compute trajectories and labelled windows of a recording with a camera.
 
-Join the camera's boxes of a recording into passes, and smooth each of them together with the seconds before
-it: trajectories with covariance, the hidden phase included, and T0, the first line of sight, with its
-standard deviation. For a standing ego.
+Join the camera's boxes into passes and smooth each pass together with the seconds before it. The result is
+the trajectory with its covariance, including the hidden phase, and T0, the first line of sight, with its
+standard deviation. The ego must stand.
 
---out is JSON in the layout of ASAM OpenLABEL. --windows is a list of labelled seconds, which
-`model features --labels` and `model fit --labels` read: recordings of one's own become training data without
-marking by hand. It lies in the recording's folder or above it.
+--out is JSON in the layout of ASAM OpenLABEL. --windows is a list of labelled seconds for `model features
+--labels` and `model fit --labels`, so that your own recordings become training data without manual labels. It
+must be in the folder of the recording or above it.
 
-The folder that `hear` wrote is an INPUT as well: --windows is then the list of all its recordings in which a
-camera looked, by when vehicles were handed over to it (some 0.2 s late), and no recording is read again. It
-belongs into the folder that was heard.
+INPUT may also be a folder of `hear`. Then --windows lists all its recordings with a camera, by the times at
+which vehicles were handed over to it (about 0.2 s late), without reading the recordings again. It must be in
+the folder of the recordings.
 
 Examples
 --------
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate import adapters
-from worldstate.cli.common import inputs, output, progress, sensors
+from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.corpus.corpus_inputs import CARD_NAME
 
@@ -38,19 +38,20 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     inputs.add_sound_options(parser)
-    sensors.add_sensor_options(parser)
+    inputs.add_sensor_options(parser)
     add = parser.add_argument_group("output").add_argument
-    add("--out", type=Path, metavar="JSON", help="trajectories and T0, OpenLABEL; needed of a recording")
+    add("--out", type=Path, metavar="JSON", help="trajectories and T0, OpenLABEL; required for a recording")
     add("--windows", type=Path, metavar="CSV", help="labelled seconds for `model fit --labels`")
     add("--figure", type=Path, metavar="PNG", help="draw the passes as seen from above")
-    site = "name of the place, S.. (default: S and the name of the recording's folder)"
+    site = "name of the place, S.. (default: S and the name of the folder)"
     add("--environment", metavar="NAME", help=site)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     import numpy as np
 
+    from worldstate.adapters.audio.sound_file import SoundStream
     from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.adapters.files.file_io import write_json, write_rows
     from worldstate.operations.labelling import label_files, pass_labels, street_figure
@@ -59,10 +60,10 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     if (arguments.input[0] / CARD_NAME).is_file():
         return _of_corpus(arguments)
     if arguments.out is None:
-        raise InvalidArgumentError("--out: expected it, of a recording")
-    if arguments.windows is not None and inputs.bag_of(arguments) is not None:
-        raise InvalidArgumentError("--windows: expected none of a bag, which `model features` does not read")
-    source, detections = sensors.camera_source(arguments, inputs.sound_of(arguments))
+        raise InvalidArgumentError("--out: expected it for a recording")
+    source, detections = inputs.camera_source(arguments, arguments.input)
+    if arguments.windows is not None and isinstance(source.sound, SoundStream):
+        raise InvalidArgumentError("--windows: expected none for a bag, which `model features` does not read")
     file = None if arguments.windows is None else label_files.file_below(source.audio_path, arguments.windows)
     tracks = pass_labels.box_tracks(detections, source.camera, source.settings.boxes)
     with progress.progress_bar("smoothing", len(tracks)) as bar:
@@ -86,12 +87,12 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _of_corpus(arguments: argparse.Namespace) -> output.CommandResult:
-    """List the windows of a corpus that was heard."""
+    """List the windows of a folder of `hear`."""
     from worldstate.adapters.files.file_io import write_rows
     from worldstate.operations.labelling.label_files import COLUMNS, corpus_windows
 
     if arguments.windows is None or arguments.out is not None or len(arguments.input) > 1:
-        raise InvalidArgumentError("--windows: expected it, of what `hear` wrote, and no --out")
+        raise InvalidArgumentError("--windows: expected it for a folder of `hear`, without --out")
     rows = list(corpus_windows(arguments.input[0]))
     write_rows(arguments.windows, COLUMNS, rows)
     return output.CommandResult({"windows": str(arguments.windows), "n_windows": len(rows)})

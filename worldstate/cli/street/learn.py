@@ -1,21 +1,21 @@
-"""`worldstate street learn`: what the vehicles that passed tell of a street.
+"""`worldstate street learn`: learn a street from passing vehicles.
 
-Join the camera's boxes into passes, smooth them, and learn from each vehicle that came out of hiding: where
-the edge stands past which it came into view, how fast it was there, what either arm sounded like before, and
-how many come from either side in which time. For a standing ego.
+Join the camera's boxes into passes, smooth them, and learn from each vehicle that came out of hiding: the
+edge behind which it came into view, its pace there, the sound of either arm before, and the rate of arrivals
+per side. The ego must stand.
 
-INPUT is a recording with boxes of a camera, as `worldstate street label` takes it. --known goes on from a
-street that was learned before. `worldstate run --street` takes what --out writes.
+INPUT is a recording with boxes of a camera, as for `worldstate street label`. --known continues from an
+earlier file. `worldstate run --context` takes the file of --out.
 
-An edge that vehicles no longer come out of is learned anew after two or three of them; what was learned
-long ago is forgotten slowly.
+An edge that vehicles no longer come out of is learned again after two or three vehicles. Older passes lose
+their weight slowly.
 
 Examples
 --------
   worldstate street learn monday.wav --array mics.csv --detections boxes.json --out street.json
   worldstate street learn ovad_dataset/SB1/left/* --out street.json --figure street.png
   worldstate street learn tuesday.wav --detections boxes.json --known street.json --days 1 --out street.json
-  worldstate run ovad_dataset/SB1/left/2_00_0005 --street street.json
+  worldstate run ovad_dataset/SB1/left/2_00_0005 --context street.json
 """
 
 import argparse
@@ -24,41 +24,43 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from worldstate import adapters, ground
-from worldstate.cli.common import output, progress, sensors
+from worldstate.cli.common import inputs, output, progress
 
 if TYPE_CHECKING:
     from worldstate.operations.labelling.street_passes import WatchedRecording
     from worldstate.smoothing.learned_street import LearnedArm, LearnedStreet
 
-# Drawn beside what all passes tell.
+# Numbers of passes that are drawn beside the result of all passes.
 STAGES = (1, 3, 10)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    sensors.add_sensor_options(parser)
+    inputs.add_sensor_options(parser)
     add = parser.add_argument
     add("input", type=Path, nargs="+", metavar="INPUT", help="recordings of one place, in order")
-    add("--known", type=Path, metavar="JSON", help="a street that was learned before")
-    add("--days", type=float, default=0.0, metavar="D", help="since then (default: %(default)g)")
+    add("--known", type=Path, metavar="JSON", help="file of an earlier run")
+    add("--days", type=float, default=0.0, metavar="D", help="days since then (default: %(default)g)")
     add("--site", metavar="NAME", help="name of the place (default: the known street's)")
-    add("--model", type=Path, help="that listens (default: the one that ships)")
+    add("--model", type=Path, help="model that is used (default: the shipped one)")
     add(
         "--sides", action=argparse.BooleanOptionalAction, default=True,
-        help="learn what either arm sounds like, which takes listening to all of it (default: on)",
+        help="learn the sound of either arm, which needs the whole recording (default: on)",
     )  # fmt: skip
     add = parser.add_argument_group("output").add_argument
-    add("--out", type=Path, required=True, metavar="JSON", help="what was learned")
-    add("--figure", type=Path, metavar="PNG", help="draw it as seen from above, after 1, 3, 10, all passes")
+    add("--out", type=Path, required=True, metavar="JSON", help="file to write")
+    add(
+        "--figure", type=Path, metavar="PNG", help="draw the street from above, after 1, 3, 10 and all passes"
+    )
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
-    """Run the command; return what it found."""
+    """Run the command; return its result."""
     from worldstate.operations.labelling.street_passes import streets_after, write_street
 
     ground.in_range("--days", arguments.days, 0.0, 1e5)
-    sensors.check_boxes(arguments, len(arguments.input))
-    # What is known may be written over: it is read before, and its passes are kept.
+    inputs.check_boxes(arguments, len(arguments.input))
+    # --out may replace the file of --known, which is read before.
     apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})
     output.check_outputs(apart, "out", figures=("figure",))
     before = street = _known(arguments)
@@ -89,10 +91,10 @@ def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     """Return the passes of a recording."""
     from dataclasses import replace
 
-    from worldstate.adapters.audio.sound_file import as_sound, open_sound
+    from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.operations.labelling.street_passes import heard_street, watched_recording
 
-    source, detections = sensors.camera_source(arguments, as_sound((path,)))
+    source, detections = inputs.camera_source(arguments, [path])
     model = adapters.read_model(arguments.model, array=source.array)
     with open_sound(source.sound, channels=source.array.channels) as audio:
         duration_s = audio.duration_s

@@ -13,15 +13,11 @@ from typing import Any, Unpack
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.adapters.audio.sound_file import SoundInput
-from worldstate.adapters.camera.detections import DetectionLog
-from worldstate.adapters.files.array_file import file_of_model, read_array
+from worldstate.adapters.files.array_file import file_of_model
 from worldstate.adapters.files.file_io import read_json, write_json
 from worldstate.adapters.files.model_file import Model, read_model
-from worldstate.adapters.files.odometry_file import read_odometry
 from worldstate.adapters.listener import listen_steps
-from worldstate.adapters.ros.bag_input import is_bag, needed_array, read_bag
-from worldstate.adapters.source import CorpusParts, Source, open_source
+from worldstate.adapters.source import Source, SourceParts, SourceSensors, open_source, settings_with
 from worldstate.adapters.state_log import PARQUET, is_own_mcap, read_log
 from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -41,6 +37,7 @@ from .cascade import SAMPLED, kept_seconds
 from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
 from .corpus_tables import TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_rows
 
+_IN_SETTINGS = "settings", "budget", "alpha", "uncalibrated"
 # Version of the tables; each major version reads only its own.
 _SCHEMA = {"name": "worldstate.Corpus", "version": "1.0.0"}
 
@@ -67,18 +64,30 @@ class HearPlan:
     card: dict[str, Any]  # Description of the folder, with a digest of everything but the recordings
 
     @classmethod
-    def begun(cls, out: Path, hops: bool, cascade: bool, parts: CorpusParts) -> "HearPlan":
+    def begun(
+        cls,
+        out: Path,
+        hops: bool,
+        cascade: bool,
+        array: Path | str | MicrophoneArray | None,
+        parts: SourceParts,
+    ) -> "HearPlan":
         """Create the folder and return the plan; refuse a folder that was created with other settings."""
         others: dict[str, Any] = {
             name: Path(one).absolute() if isinstance(one, Path | str) else one
             for name, one in parts.items()
-            if one is not None and name not in ("array", "model")
+            if one is not None and name not in ("car", "camera", "model", *_IN_SETTINGS)
         }
-        array: Any = parts.get("array")
-        model: Any = parts.get("model")
+        asked: dict[str, Any] = {name: one for name, one in parts.items() if name in _IN_SETTINGS}
+        sensors = SourceSensors.of(array, parts.get("car"), parts.get("camera"))
+        array, model = sensors.car.array, parts.get("model") or sensors.car.model
+        if sensors.camera is not None:
+            others["camera"] = sensors.camera
+        others["settings"] = sensors.boxes_in(settings_with(**asked))
+        if sensors.setup.miss_rates is not None:
+            others.setdefault("miss_rates", sensors.setup.miss_rates.absolute())
         if isinstance(model, Model):
             raise InvalidArgumentError("model: expected a file or the name of a shipped model")
-        array = read_array(array) if isinstance(array, Path | str) else array
         read_model(model, array=array)  # Rejects a wrong model before the work starts
         file = file_of_model(model, array)
         # The digest depends on the microphones of an array, not on its file name.
@@ -121,6 +130,7 @@ def _plain(value: Any) -> Any:
 def hear(
     corpus: Path | str,
     out: Path | str,
+    array: Path | str | MicrophoneArray | None = None,
     *,
     jobs: int = 1,
     executor: Executor | None = None,
@@ -128,7 +138,7 @@ def hear(
     hops: bool = False,
     cascade: bool = False,
     on_recording: Callable[[HeardShard], object] = lambda shard: None,
-    **parts: Unpack[CorpusParts],
+    **parts: Unpack[SourceParts],
 ) -> list[HeardShard]:
     """Process every recording of a corpus and write its approaches as Parquet.
 
@@ -160,8 +170,8 @@ def hear(
     on_recording : callable
         Called after each recording, for progress.
     **parts
-        Arguments of `open_source`: `array`, `camera`, `miss_rates`, `model`, `context`, `sides`, `budget` or
-        `alpha`, `settings`.
+        Arguments of `open_source`: `car`, `camera`, `miss_rates`, `model`, `context`, `sides`, `budget` or
+        `alpha`, `uncalibrated`, `settings`.
 
     Returns
     -------
@@ -191,7 +201,7 @@ def hear(
     if cascade and hops:
         raise InvalidArgumentError("cascade: expected it without hops, because it skips some of them")
     inputs = share_of(find_corpus(Path(corpus).absolute()), *shard)
-    plan = HearPlan.begun(Path(out).absolute(), hops, cascade, parts)
+    plan = HearPlan.begun(Path(out).absolute(), hops, cascade, array, parts)
     former = defaultdict[str, list[Path]](list)
     for path in plan.out.glob(f"*/*-*{PARQUET}"):
         former[path.name.partition("-")[0]].append(path)
@@ -266,15 +276,9 @@ def _hops(source: Source, meter: ApproachMeter) -> Iterator[HeardHop]:
 
 
 def _source(plan: HearPlan, one: CorpusInput) -> Source:
-    sound: SoundInput = one.path
-    detections: Path | DetectionLog | None = one.detections
-    array, ego = plan.array, None if one.odometry is None else read_odometry(one.odometry)
-    if is_bag(one.path):
-        held = read_bag(one.path)
-        array, sound = needed_array(held.sound, array or held.array), held.sound
-        detections, ego = detections or held.detections, ego or held.ego
     model = None if plan.model is None else _model(plan.model)
-    return open_source(sound, array=array, model=model, detections=detections, ego=ego, **plan.others)
+    given: dict[str, Any] = {"model": model, "detections": one.detections, "odometry": one.odometry}
+    return open_source(one.path, plan.array, **given, **plan.others)
 
 
 @cache
