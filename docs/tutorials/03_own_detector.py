@@ -49,7 +49,7 @@ images = SimpleNamespace(frames=lambda: map(image, lefts), count=len(lefts))
 video = LabelledVideo(images, truth, PinholeCamera.ovad(width_px=320, height_px=200))
 rates = measure_absence([video], BrightColumns, rng, AbsenceSettings(families=("noise",)))
 with tutorial_figure(__file__, 8.0, 3.6) as figure:
-    save_miss_rates("out/tutorials/my_detector.json", rates)  # "miss_rates" of a camera file
+    save_miss_rates("out/tutorials/my_detector.json", rates)  # for the key `miss_rates` of a camera
     beta, worth = figure.subplots(1, 2, sharex=True, sharey=True)
     for degrees in (0.0, 20.0, 30.0):
         missed = [rates.table(np.radians(degrees), level) for level in levels]
