@@ -163,25 +163,24 @@ def named_arrays() -> dict[str, dict[str, Any]]:
     return known
 
 
-def shipped_models() -> list[str]:
-    """Return the names of the models that ship in addition to the two for the roof array."""
-    return sorted(one.name.removesuffix(PACKED) for one in MODELS.glob(f"*{PACKED}"))
+def shipped_models() -> dict[str, Path]:
+    """Return the files of the shipped models by name; the two for the roof array come first."""
+    roof = {"standing": DATA / "default_model.json", "moving": DATA / "moving_model.json"}
+    return roof | {one.name.removesuffix(PACKED): one for one in sorted(MODELS.glob(f"*{PACKED}"))}
 
 
 def file_of_model(
     path: str | Path | None = None, array: MicrophoneArray | None = None, *, moving_ego: bool = False
 ) -> Path:
     """Return the file that `read_model` reads for these arguments."""
-    named = shipped_models()
-    if path is not None and (str(path) not in named or Path(path).exists()):
+    shipped = shipped_models()
+    if path is not None and (str(path) not in shipped or Path(path).exists()):
         return Path(path)
     boards = named_arrays() if path is None and array is not None else {}
-    for name in boards.keys() & {*named}:
+    for name in boards.keys() & shipped.keys():
         if array is not None and microphone_order(np.array(boards[name]["positions_m"]), array) is not None:
             path = name
-    if path is not None:
-        return MODELS / f"{path}{PACKED}"
-    return DATA / ("moving_model.json" if moving_ego else "default_model.json")
+    return shipped[str(path or ("moving" if moving_ego else "standing"))]
 
 
 def write_array_xml(path: str | Path, array: MicrophoneArray, name: str = "array") -> None:

@@ -67,9 +67,7 @@ def listed(names: list[str], cards: dict[str, dict]) -> str:
 
 def page() -> str:
     """Return the page."""
-    models = {name: read_model(moving_ego=name == "moving") for name in ("standing", "moving")}
-    models |= {name: read_model(name) for name in shipped_models()}
-    return "".join(parts({name: model_card(model) for name, model in models.items()}))
+    return "".join(parts({name: model_card(read_model(name)) for name in shipped_models()}))
 
 
 if __name__ == "__main__":

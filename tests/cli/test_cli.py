@@ -200,6 +200,9 @@ def test_a_list_names_what_there_is_and_what_ships(word, tmp_path, monkeypatch, 
     else:
         assert list(told) == ["standing", "moving", "uma-8"]
         assert [row["ego_motion"] for row in told.values()] == ["standing", "moving", "standing"]
+        for name in told:  # Each listed name is accepted
+            assert main(["model", "show", name, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out.splitlines()[0])["ego_motion"] == "standing"
     assert main([word, "list"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == len(told)
 

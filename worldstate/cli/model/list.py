@@ -27,8 +27,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
     from worldstate.adapters.files.array_file import shipped_models
 
-    models = {name: adapters.read_model(moving_ego=name == "moving") for name in ("standing", "moving")}
-    models |= {name: adapters.read_model(name) for name in shipped_models()}
+    models = {name: adapters.read_model(name) for name in shipped_models()}
     cards = {name: model_card(model) for name, model in models.items()}
     rows = {name: {key: card[key] for key in _SHOWN} for name, card in cards.items()}
     line = "{array}, {microphones} microphones, {spacing_mm:g} mm apart; {ego_motion} ego; of {data}"
