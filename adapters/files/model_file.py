@@ -200,8 +200,8 @@ def read_model(
     Parameters
     ----------
     path : str or Path, optional
-        JSON file, compressed if its name ends in .gz, or the name of a shipped model (`worldstate model
-        list`).
+        JSON file, compressed if its name ends in .gz, or the name of a shipped model; the command
+        `worldstate model list` prints the names.
     moving_ego : bool
         Use the roof-array model for a moving ego instead of the one for a standing ego.
     array : MicrophoneArray, optional
