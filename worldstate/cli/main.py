@@ -34,10 +34,9 @@ GROUPS = {
     "log": "draw, view, replay and upgrade the snapshots of a run",
     "sim": "simulated streets",
 }
-# Former names of commands and options, with their successors, until the next minor version. Studies are
-# commands of `worldstate-lab`, a distribution of its own.
+# Former commands and options with their successors, for the error.
 _NAMES = (files("worldstate") / "data" / "former_names.json").read_text("utf-8")
-FORMER, STUDIES, FORMER_OPTIONS = json.loads(_NAMES).values()
+FORMER, FORMER_OPTIONS = json.loads(_NAMES).values()
 DESCRIPTION, _, EPILOG = (__doc__ or "").strip().partition("\n\n")
 
 _MODULES = {words: "worldstate.cli." + words.replace(" ", ".").replace("-", "_") for words in COMMANDS}
@@ -45,15 +44,10 @@ PROGRAM = Program("worldstate", DESCRIPTION, EPILOG, _MODULES, GROUPS, ("complet
 
 
 def current_words(words: Sequence[str]) -> list[str]:
-    """Return the words of a call with a former command replaced by its successor; refuse a study."""
+    """Return the words of a call, `help run` as `run --help`; refuse a former command."""
     first, *rest = words or [""]
-    if first in STUDIES:
-        successor = f"`worldstate-lab {STUDIES[first]}`, of the distribution worldstate-lab"
-        raise InvalidArgumentError(f"{first}: expected {successor}")
     if first in FORMER:
-        print(f"worldstate: `{first}` is now `{FORMER[first]}`", file=sys.stderr)
-        return [*FORMER[first].split(), *rest]
-    # `worldstate help run` is `worldstate run --help`.
+        raise InvalidArgumentError(f"{first}: expected `{FORMER[first]}` in its place")
     return [*rest, "--help"] if first == "help" else list(words)
 
 
