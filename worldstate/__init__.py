@@ -1,4 +1,4 @@
-"""A structured world-state that lasts when a sensor goes blind.
+"""A structured world-state that remains available when a sensor fails.
 
 Importing the package loads nothing; each name is imported at its first use. The packages `abduction`,
 `adapters`, `frontend`, `measurement`, `operations`, `simulation`, `smoothing` and `state` export more names.

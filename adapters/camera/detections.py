@@ -1,4 +1,4 @@
-"""Detections of a camera image by image: the detector's interface, OVAD, COCO, YOLO, MOTChallenge files."""
+"""Detections by image: the interface of a detector; OVAD, COCO, YOLO and MOTChallenge files."""
 
 import logging
 import math
@@ -20,44 +20,44 @@ from .class_names import COCO_CATEGORIES, ROAD_USERS, YOLO_NAMES, class_name
 
 _LOG = logging.getLogger(__name__)
 MAX_BYTES = 64 << 20
-MAX_FRAMES, MAX_BOXES = 250_000, 1_000_000  # two hours at 30 images a second
+MAX_FRAMES, MAX_BOXES = 250_000, 1_000_000  # Two hours at 30 images per second
 MAX_BOXES_A_FRAME = 1000
 MAX_FRAME_RATE_HZ = 1000.0
-# Detectors round boxes outwards: so far beyond the border of an image they are left as they are.
+# Detectors round boxes outwards: boxes this far beyond the border are not clipped.
 BORDER_PX = 1.0
-# Images a second, where neither their stamps nor the user state it: OVAD's.
+# Images per second if neither their stamps nor the user give it: OVAD's rate.
 IMAGE_RATE_HZ = 10.0
-# Decisions at 47,998 Hz fall up to half a sample (10 us) before the frame that they belong to.
+# At 47,998 Hz a decision is up to half a sample (10 us) before the frame that it belongs to.
 STAMP_SLACK_NS = 1_000_000
-# The road users among the eighty names that YOLO text counts through.
+# The road users among the eighty classes of YOLO text.
 YOLO_CLASSES: Mapping[int, str] = {i: name for i, name in enumerate(YOLO_NAMES) if name in ROAD_USERS}
-# Of MOTChallenge's ground truth; -1 stands for what a line does not state.
+# Classes of MOTChallenge's ground truth; -1 marks a missing value.
 MOT_CLASSES: Mapping[float, str] = {
     -1: "car", 1: "person", 2: "rider", 3: "car", 4: "bicycle", 5: "motorcycle", 6: "cart without a motor",
     7: "person",
 }  # fmt: skip
-MAX_TEXT_BYTES = 1 << 20  # of one frame in YOLO text
-# Roboflow puts a hash of the image behind its name.
+MAX_TEXT_BYTES = 1 << 20  # Limit for one frame in YOLO text
+# Roboflow appends a hash of the image to its name.
 _HASH = re.compile(r"(_(jpe?g|png|bmp|webp|tiff?|gif))?\.rf\.\w+$", re.IGNORECASE)
 _NUMBERED = re.compile(r"(?!-\d+$)(.*?)(\d{1,19})", re.ASCII)
-# What exporters put beside labels.
+# Files that exporters write beside labels.
 _NO_LABELS = frozenset({"classes.txt", "README.txt", "README.dataset.txt", "README.roboflow.txt"})
-# What others call the time of an image.
+# Other names for the time of an image.
 _TIMES = {f"{name}{unit}" for name in ("stamp", "timestamp", "time") for unit in ("", "_s", "_ms", "_us")}
 _PER_FRAME = re.compile(r'"detections_per_frame"\s*:\s*\[')
 _FORMS = "`worldstate run --help-all` lists the forms that detections may have"
-# Car and bus if categories are counted from 0 as by YOLO, bicycle and airplane from 1 as by COCO.
+# Car and bus if categories start at 0 as in YOLO, bicycle and airplane if they start at 1 as in COCO.
 _UNSURE = frozenset({"2", "5"})
 # Fewer numbers than these may have a common step by chance.
 _LEAST_NUMBERS = 3
 
-# A box is parked when a box stood at its place, every edge within so many pixels, in this share of the images
-# of so many seconds; below 1 because detectors miss now and then.
+# A box is parked if a box had the same edges, within these pixels, in this share of the images of these
+# seconds; the share is below 1 because detectors miss some images.
 PARKED_S, PARKED_PX, PARKED_SHARE = 1.0, 5.0, 0.8
-# Of the images for which the least height of a box and these pixels were chosen.
+# Image height for which the minimum height of a box and these pixels were chosen.
 OVAD_HEIGHT_PX = 1216.0
 Row = tuple[tuple[float, float, float, float], float, str]
-# Beyond any image, and a sum of two is still a number.
+# Beyond any image; the sum of two such numbers is finite.
 MAX_NUMBER = 1e9
 Place = Annotated[float, Check("a number below 1e9", lambda value: abs(value) < MAX_NUMBER)]
 Extent = Annotated[float, Check("a number in [0, 1e9)", lambda value: 0.0 <= value < MAX_NUMBER)]
@@ -70,11 +70,11 @@ def _name(value: object) -> str:
 
 
 def _array(values: Any) -> FloatArray:
-    """Return numbers as an array, also those of a tensor in the memory of an accelerator."""
+    """Return numbers as an array, also from a tensor in the memory of an accelerator."""
     return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=np.float64)
 
 
-# Of a class, category or image; some write numbers.
+# Name of a class, category or image; some files have numbers.
 Name = Annotated[str, Via(object, _name, _name)]
 
 
@@ -89,12 +89,12 @@ class DetectionFrame:
     scores : ndarray
         Shape (n,), in [0, 1].
     labels : tuple of str
-        n class names, as the detector says them.
+        n class names of the detector.
 
     Raises
     ------
     InvalidArgumentError
-        On another shape, a box turned inside out, a score out of range, NaN.
+        If a shape is wrong, a box is inverted, a score is out of range, or a number is NaN.
 
     Examples
     --------
@@ -116,7 +116,7 @@ class DetectionFrame:
             object.__setattr__(self, name, numbers)
         object.__setattr__(self, "labels", tuple(self.labels))
         left, top, right, bottom = self.boxes_px.T
-        # Written so that NaN, for which every comparison is false, is refused.
+        # This form refuses NaN, for which every comparison is false.
         fit = (left <= right) & (top <= bottom) & (self.scores >= 0.0) & (self.scores <= 1.0)
         if not fit.all():
             first = int(np.argmin(fit))
@@ -126,16 +126,16 @@ class DetectionFrame:
 
     @classmethod
     def of(cls, found: Any) -> "DetectionFrame | None":
-        """Return the boxes of one image from the result of a detector; None if it is of no known kind.
+        """Return the boxes of one image from the result of a detector; None for an unknown type.
 
-        Known kinds are `DetectionFrame`, supervision's `Detections` and ultralytics' `Results`, which are
-        recognised by their attributes, and a list that holds one of them, as a model of ultralytics returns.
-        Boxes without scores get the score 1.
+        Known types are `DetectionFrame`, supervision's `Detections` and ultralytics' `Results`, which are
+        recognised by their attributes, and a list of one of them, as a model of ultralytics returns. Boxes
+        without scores get the score 1.
 
         Raises
         ------
         InvalidArgumentError
-            If boxes have no class names, or are no boxes.
+            If boxes have no class names or are invalid.
 
         Examples
         --------
@@ -169,7 +169,7 @@ class DetectionFrame:
         return len(self.labels)
 
     def cut(self, size_px: tuple[int, int]) -> tuple["DetectionFrame", int]:
-        """Return the boxes within an image, cut at its border, and how many reach beyond or lie outside.
+        """Return the boxes clipped to an image, and the number of boxes that extend beyond it or are outside.
 
         Examples
         --------
@@ -189,7 +189,7 @@ class DetectionFrame:
         return frame, int(beyond.sum())
 
     def select(self, keep: "DetectionFilter") -> IntArray:
-        """Return the indices of the boxes that `keep` lets through."""
+        """Return the indices of the boxes that pass the filter `keep`."""
         heights_px = self.boxes_px[:, 3] - self.boxes_px[:, 1]
         named = np.array([class_name(label) in keep.labels for label in self.labels], dtype=bool)
         high = heights_px > keep.min_height_px * keep.scale
@@ -198,19 +198,19 @@ class DetectionFrame:
 
 @dataclass(frozen=True, slots=True)
 class DetectionFilter:
-    """Which boxes count; the defaults are those of the authors of OVAD.
+    """Filter for the boxes that are used; the defaults are those of the authors of OVAD.
 
     Parameters
     ----------
     labels : collection of str
-        Classes that count as a road user, in the words of any data set (`class_name`).
+        Classes of road users, in the words of any data set (`class_name`).
     min_score : float
         Lowest score, in [0, 1].
     min_height_px : float
-        Boxes must be higher than this in an image of OVAD's height, 1216 pixels, which leaves the far ones
-        out; it scales with the image.
+        Boxes must be higher than this in an image of OVAD's height, 1216 pixels, which excludes distant ones;
+        it scales with the image.
     image_height_px : float
-        Height of the images that the boxes are of.
+        Height of the images of the boxes.
 
     Raises
     ------
@@ -236,13 +236,13 @@ class DetectionFilter:
 
     @property
     def scale(self) -> float:
-        """Height of the images in that of OVAD's."""
+        """Height of the images relative to OVAD's."""
         return self.image_height_px / OVAD_HEIGHT_PX
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionLog:
-    """Frames of one camera in the order of time.
+    """Frames of one camera in order of time.
 
     Parameters
     ----------
@@ -251,16 +251,16 @@ class DetectionLog:
     stamps_ns : ndarray
         Shape (n,), int64, strictly increasing, nanoseconds on the stream's clock.
     source : str
-        Where it comes from, for messages: the file's name.
+        Origin for messages: the name of the file.
     counted_hz : float or None
-        Images a second, where they carry no stamp and are counted from the first sample of the sound.
+        Images per second, if they carry no stamp and are numbered from the first sample of the sound.
     assumed : bool
-        Whether nobody stated that rate.
+        Whether that rate is a default.
 
     Raises
     ------
     InvalidArgumentError
-        If the two do not fit or the stamps are not in order.
+        If the lengths differ or the stamps are not in order.
 
     Examples
     --------
@@ -293,9 +293,9 @@ class DetectionLog:
         source: str = "detections",
         numbers: Sequence[int] | None = None,
     ) -> "DetectionLog":
-        """Stamp frame i with i / rate, or its number / rate, counted from the start of the recording.
+        """Stamp frame i with i / rate, or its number / rate, from the start of the recording.
 
-        Without a rate it is 10, which is then held against the length of the sound.
+        Without a rate it is 10, which is then compared with the length of the sound.
 
         Raises
         ------
@@ -310,7 +310,7 @@ class DetectionLog:
     def in_order(
         cls, frames: Sequence[DetectionFrame], stamps_ns: Sequence[int], source: str = "detections"
     ) -> "DetectionLog":
-        """Sort images by their stamps; of several with one stamp the last counts, and a warning counts them.
+        """Sort images by stamp; of several with one stamp the last is used, with a warning.
 
         Examples
         --------
@@ -326,11 +326,11 @@ class DetectionLog:
         return len(self.frames)
 
     def shifted(self, offset_s: float) -> "DetectionLog":
-        """Return the same frames with stamps that are later by so many seconds."""
+        """Return the same frames with stamps later by an offset, seconds."""
         return replace(self, stamps_ns=self.stamps_ns + nanoseconds(offset_s))
 
     def on_clock(self, start_ns: int, offset_s: float) -> "DetectionLog":
-        """Return it on the clock of a sound that starts then: stamps are moved by the offset of the camera.
+        """Return the log on the clock of a sound with this start: stamps are shifted by the camera's offset.
 
         Examples
         --------
@@ -342,12 +342,12 @@ class DetectionLog:
         return replace(self, stamps_ns=self.stamps_ns + counted_from_ns).shifted(offset_s)
 
     def latest(self, stamp_ns: int, max_age_ns: int) -> int | None:
-        """Return the number of the last frame taken at or before `stamp_ns`, None if too old or not there."""
+        """Return the number of the last frame at or before `stamp_ns`, None if it is too old or missing."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns + STAMP_SLACK_NS, side="right")) - 1
         return None if index < 0 or stamp_ns - int(self.stamps_ns[index]) > max_age_ns else index
 
     def left_out(self, frame: int, keep: DetectionFilter) -> IntArray:
-        """Return the indices of the moving boxes of an image that do not count; a score of 0 is no box.
+        """Return the indices of the moving boxes of an image that are not used; a score of 0 is no box.
 
         Examples
         --------
@@ -368,12 +368,12 @@ def _rate_hz(stated: float | None) -> float:
 def parked(log: DetectionLog, frame: int, boxes_px: FloatArray, scale: float = 1.0) -> BoolArray:
     """Return which boxes (n, 4) of an image are parked, from that image and earlier ones, shape (n,).
 
-    For a standing camera: from a moving one every box moves, and none is parked. `scale` is the height of the
-    images in that of OVAD's.
+    The camera must stand: in images of a moving camera every box moves, and none is parked. `scale` is the
+    height of the images relative to OVAD's.
     """
     since_ns = int(log.stamps_ns[frame]) - nanoseconds(PARKED_S)
     past = log.frames[int(np.searchsorted(log.stamps_ns, since_ns - STAMP_SLACK_NS)) : frame]
-    # Most images of a hidden approach are empty, and this is asked several times a hop.
+    # Most images of a hidden approach are empty, and this runs several times per hop.
     if not past or not len(boxes_px) or log.stamps_ns[0] > since_ns + STAMP_SLACK_NS:
         return np.zeros(len(boxes_px), dtype=bool)
     apart_px = (np.abs(boxes_px[:, None] - earlier.boxes_px[None]).max(axis=2) for earlier in past)
@@ -395,13 +395,13 @@ COUNTS_TOLD = (
 
 
 def told_counts(counts: Mapping[str, int]) -> str:
-    """Return the counts of boxes in words."""
+    """Return the numbers of boxes in words."""
     none = counts["boxes"] and not counts["counted"] + counts["parked"]
     return COUNTS_TOLD.format(**counts) + ("; none counts: the camera is impaired" if none else "")
 
 
 def count_boxes(log: DetectionLog, keep: DetectionFilter) -> dict[str, int]:
-    """Count the boxes of a log by what becomes of them: each is put down to the first reason."""
+    """Count the boxes of a log by the first reason that applies to each."""
     looser = replace(keep, min_score=0.0, min_height_px=0.0), replace(keep, min_height_px=0.0), keep
     named, scored, high = (sum(len(frame.select(one)) for frame in log.frames) for one in looser)
     boxes = sum(map(len, log.frames))
@@ -412,9 +412,9 @@ def count_boxes(log: DetectionLog, keep: DetectionFilter) -> dict[str, int]:
 
 
 class Detector(Protocol):
-    """Detector of objects in images that are given in the order of time.
+    """Detector of objects in images in order of time.
 
-    A detector may have a state, as one of motion must; a new one is made for every video.
+    A detector may have a state, such as the background of a motion detector; each video needs a new one.
 
     Examples
     --------
@@ -431,7 +431,7 @@ class Detector(Protocol):
         Parameters
         ----------
         frame : ndarray of uint8, shape (height, width, 3)
-            Blue first.
+            Image in the order blue, green, red.
 
         Returns
         -------
@@ -444,15 +444,15 @@ def read_detections(path: str | Path, frame_rate_hz: float | None = None) -> Det
     """Read per-frame detections in OVAD's JSON.
 
     ``{"detections_per_frame": [{"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...]},
-    ...]}`` with other keys ignored. A detector of your own may add ``"stamp_ns"`` to every frame; without it
-    frame i shows the time i / `frame_rate_hz` from the start of the recording.
+    ...]}``; other keys are ignored. A detector of your own may add ``"stamp_ns"`` to every frame; without it
+    frame i has the time i / `frame_rate_hz` from the start of the recording.
 
     Parameters
     ----------
     path : str or Path
-        The file; at most 64 MiB, 250,000 frames, 1000 boxes a frame.
+        The file; at most 64 MiB, 250,000 frames, 1000 boxes per frame.
     frame_rate_hz : float, optional
-        Frames a second where the frames carry no stamp; 10 where not given.
+        Frames per second if the frames carry no stamp; 10 by default.
 
     Returns
     -------
@@ -462,8 +462,8 @@ def read_detections(path: str | Path, frame_rate_hz: float | None = None) -> Det
     Raises
     ------
     InputFileError
-        Names the file and the frame: missing, too large, no JSON, keys missing, other types, lengths that
-        differ, numbers that are not finite, boxes turned inside out, scores outside [0, 1].
+        If the file is missing, too large or not JSON, if keys are missing or types wrong, if lengths differ,
+        if numbers are not finite, boxes inverted or scores outside [0, 1]; the message gives file and frame.
     InvalidArgumentError
         If the rate is not above 0 and at most 1000.
 
@@ -478,7 +478,7 @@ def read_detections(path: str | Path, frame_rate_hz: float | None = None) -> Det
     ('car',)
     """
     name = Path(path)
-    _rate_hz(frame_rate_hz)  # before a long file is read
+    _rate_hz(frame_rate_hz)  # Before a long file is read
     return _ovad_log(name, read_text(name, "a detections file", MAX_BYTES), frame_rate_hz)
 
 
@@ -513,7 +513,7 @@ def _ovad_log(name: Path, text: str, frame_rate_hz: float | None) -> DetectionLo
 
 @dataclass(frozen=True, slots=True)
 class _OvadFrame:
-    """What OVAD's file holds of one image."""
+    """Record of one image in OVAD's file."""
 
     boxes: FloatArray
     scores: FloatArray
@@ -524,14 +524,14 @@ class _OvadFrame:
         if not len(self.boxes) == len(self.scores) == len(self.classes_str) <= MAX_BOXES_A_FRAME:
             got = f"{len(self.boxes)} boxes, {len(self.scores)} scores, {len(self.classes_str)} classes_str"
             raise InvalidArgumentError(f"expected as many of each, at most {MAX_BOXES_A_FRAME}, got {got}")
-        self.frame()  # which refuses boxes that cannot be
+        self.frame()  # Refuses invalid boxes
 
     def frame(self) -> DetectionFrame:
         return DetectionFrame(self.boxes, self.scores, self.classes_str)
 
 
 def frame_of(record: object, where: str) -> DetectionFrame:
-    """Return the boxes of one image from OVAD's record of it; `where` names it in messages."""
+    """Return the boxes of one image from OVAD's record; `where` is its place for messages."""
     return decode(_OvadFrame, record, where).frame()
 
 
@@ -542,7 +542,7 @@ class _CocoResult:
     image_id: Name
     category_id: Name
     bbox: tuple[Place, Place, Extent, Extent]
-    score: Probability | None = None  # Labels have none
+    score: Probability | None = None  # Labels have no score
 
 
 @dataclass(frozen=True, slots=True)
@@ -558,7 +558,7 @@ class _CocoId:
 
 @dataclass(frozen=True, slots=True)
 class _CocoFile:
-    """Results, and the images that were looked at."""
+    """Results, and the searched images."""
 
     annotations: tuple[_CocoResult, ...]
     images: tuple[_CocoId, ...] | None = None
@@ -577,33 +577,34 @@ def read_any_detections(
     size_px: tuple[int, int] | None = None,
     n_images: int | None = None,
 ) -> DetectionLog:
-    """Read detections of whichever form stands at `path`.
+    """Read detections in any supported form.
 
-    A folder holds YOLO text, a file ``.txt`` MOTChallenge text, a JSON list COCO results, a JSON object with
-    ``"images"`` such results beside the images that were looked at, another one OVAD's detections per frame.
-    An image without a box was searched in vain: COCO results and text do not tell those after the last box.
+    A folder contains YOLO text; a ``.txt`` file is MOTChallenge text; a JSON list is COCO results; a JSON
+    object with ``"images"`` is COCO results with the searched images; another object has OVAD's detections
+    per frame. An image without a box was searched and is empty. COCO results and text do not list the images
+    after the last box.
 
     Parameters
     ----------
     path : str or Path
         File or folder.
     frame_rate_hz : float, optional
-        Frames a second, where the frames carry no stamp; 10 where not given.
+        Frames per second if the frames carry no stamp; 10 by default.
     size_px : tuple of int, optional
-        Width and height of the image, which YOLO text is relative to.
+        Width and height of the image, to which YOLO text is relative.
     n_images : int, optional
-        The detector looked at the first `n_images` images, where COCO results or text do not tell.
+        Number of searched images, if COCO results or text do not list them.
 
     Returns
     -------
     DetectionLog
-        In the order of time.
+        In order of time.
 
     Raises
     ------
     InputFileError
-        As the reader of that form; if YOLO text is read without a size, or `n_images` is given where the file
-        lists its images.
+        As the reader of that form; if YOLO text is read without a size, or if `n_images` is given for a file
+        that lists its images.
 
     Examples
     --------
@@ -636,7 +637,7 @@ def read_any_detections(
 
 
 def _results(text: str) -> "_CocoFile":
-    """Return what a list of COCO results holds, read one by one."""
+    """Return the content of a list of COCO results, read one by one."""
     found = list[_CocoResult]()
 
     def take(item: object) -> None:
@@ -658,10 +659,10 @@ def coco_log(
 ) -> DetectionLog:
     """Return the log of COCO results, or of an object of ``"images"`` and results as ``"annotations"``.
 
-    A result is ``{"image_id", "category_id", "bbox": [x, y, w, h], "score"}``; image i is taken i / rate
-    after the start, and without a score it counts as 1. Images whose ids count from 1, are arbitrary or names
-    stand in the order of the numbers that their ``"file_name"`` or id ends in; a listed size has to be
-    `size_px`. Categories without names are COCO's, counted from 1; if one is 0, YOLO's.
+    A result is ``{"image_id", "category_id", "bbox": [x, y, w, h], "score"}``; image i has the time i / rate
+    from the start, and a missing score is 1. Images whose ids start at 1, are arbitrary or are names are
+    ordered by the numbers at the end of their ``"file_name"`` or id; a listed size must equal `size_px`.
+    Categories without names are COCO's, which start at 1, or YOLO's if one is 0.
     """
     with refused_as_file(path):
         held = {"annotations": document} if isinstance(document, list) else document
@@ -693,19 +694,19 @@ def coco_log(
 
 
 def _category_names(read: _CocoFile) -> dict[str, str]:
-    """Return the names of categories by their ids: as listed, else COCO's or, where one is 0, YOLO's."""
+    """Return the names of categories by their ids: as listed, else COCO's, or YOLO's if one id is 0."""
     if read.categories is not None:
         return {one.id: one.name for one in read.categories if one.name is not None}
     used = {one.category_id for one in read.annotations}
     if "0" in used:
         return {str(i): name for i, name in enumerate(YOLO_NAMES)}
-    # Without a car the two ways to count cannot be told apart.
+    # Without a car the two numberings cannot be separated.
     unsure = {} if "3" in used else {one: f"category {one}" for one in _UNSURE}
     return {str(i): name for i, name in COCO_CATEGORIES.items()} | unsure
 
 
 def _image_numbers(images: Sequence[_CocoId], *, listed: bool) -> dict[str, int]:
-    """Return which image after the start each id is."""
+    """Return the image number of each id, from the start."""
     if not images:
         return {}
     ids = image_numbers([one.id for one in images])
@@ -718,20 +719,20 @@ def _image_numbers(images: Sequence[_CocoId], *, listed: bool) -> dict[str, int]
         expected = 'expected different ids that end in a number, or "images" with such a "file_name"'
         raise InvalidArgumentError(f"{expected}, got {some:.80}")
     places = {number: place for place, number in enumerate(sorted(numbers))}
-    # A list with gaps is of some images of a video, whose numbers then are those in it; or they are times.
+    # A list with gaps contains some images of a video, and the numbers are those in the video, or times.
     whole = len(_between(numbers)) == len(images) or max(numbers) >= MAX_FRAMES
     return {one.id: places[n] if whole else n for one, n in zip(images, numbers, strict=True)}
 
 
 def _first(numbers: Collection[int]) -> int:
-    """Return the number of the first image, 1 where all are listed and counted from 1, as COCO does."""
+    """Return the number of the first image: 1 if all are listed and start at 1, as in COCO."""
     return int(sorted(numbers) == [*range(1, len(numbers) + 1)])
 
 
 def image_numbers(names: Sequence[str]) -> list[int] | None:
-    """Return the numbers that names of images end in; None where they form no sequence.
+    """Return the numbers at the end of image names; None if they form no sequence.
 
-    Then one name stands before all numbers, and no number comes twice. What Roboflow adds does not count.
+    In a sequence one name precedes all numbers, and no number is repeated. Suffixes of Roboflow are ignored.
 
     Examples
     --------
@@ -758,10 +759,10 @@ def read_yolo_text(
     frame_rate_hz: float | None = None,
     n_images: int | None = None,
 ) -> DetectionLog:
-    """Read a folder of YOLO text: ``street_17.txt`` lines ``class x y w h [score]`` in parts of the image."""
+    """Read a folder of YOLO text: ``street_17.txt`` has lines ``class x y w h [score]`` in image units."""
     folder = Path(path)
     files = sorted(file for file in folder.glob("*.txt") if file.name not in _NO_LABELS)
-    # The classes that the text counts through: those that are listed beside it, else COCO's.
+    # The classes of the numbers: those listed beside the text, else COCO's.
     listed = folder / "classes.txt"
     known = read_text(listed, "a text file", MAX_TEXT_BYTES).split("\n") if listed.exists() else YOLO_NAMES
     names, numbers = dict(enumerate(known)), image_numbers([file.name for file in files[: MAX_FRAMES + 1]])
@@ -775,7 +776,8 @@ def read_yolo_text(
         with refused_as_file(file):
             lines = read_text(file, "a text file", MAX_TEXT_BYTES).splitlines()
             rows[number] = [_yolo_row(line, size_px, names) for line in lines if line.strip()]
-    # Who writes empty files, or a data set, writes one for every image: what has none was not looked at.
+    # A writer of empty files, or of a data set, writes a file for every image: other images were not
+    # searched.
     if n_images is None and (not all(rows.values()) or any(_HASH.search(file.stem) for file in files)):
         first = _first(rows)
         rows = {number - first: found for number, found in rows.items()}
@@ -809,8 +811,8 @@ def read_mot_text(
 ) -> DetectionLog:
     """Read MOTChallenge text: lines ``frame, id, left, top, width, height, conf, x, y, z``, frames from 1.
 
-    What follows `conf` may be left out; `id`, x, y, z are not used. A `conf` of -1 is not stated and counts
-    as 1. A line of nine values is ground truth, with class and visibility after `conf`, and a box of
+    The values after `conf` are optional; `id`, x, y, z are not used. A `conf` of -1 is a missing score, which
+    is 1. A line of nine values is ground truth, with class and visibility after `conf`, and a box of
     visibility 0 gets the score 0. Other boxes are cars.
 
     Examples
@@ -839,7 +841,8 @@ def _mot_row(line: str, where: str) -> tuple[int, Row]:
     expected = f"frame, id, left, top, width, height, conf with frames 1 to {MAX_FRAMES} and conf in [0, 1]"
     problem = f"{where}: expected {expected}, got {line[:60]!r}"
     try:
-        # The challenge counts pixels from 1 and most trackers from 0, which is less than boxes jitter by.
+        # Pixels start at 1 in the challenge and at 0 in most trackers; the difference is smaller than the
+        # jitter of boxes.
         frame, _, left, top, width, height, conf, *more = map(float, line.split(",", 10))
     except ValueError as error:
         raise InvalidArgumentError(problem) from error
@@ -855,7 +858,7 @@ def _mot_row(line: str, where: str) -> tuple[int, Row]:
 def _log(
     path: Path, rows: Mapping[int, list[Row]], rate_hz: float | None, looked: Sequence[int] | int | None
 ) -> DetectionLog:
-    """Stamp the images that were looked at: those of these numbers, so many, or up to the last with a box."""
+    """Stamp the searched images: those of these numbers, the first ones, or all up to the last with a box."""
     count = max(rows, default=-1) + 1
     if count > MAX_FRAMES or min(rows, default=0) < 0:
         got = count - 1 if count > MAX_FRAMES else min(rows)
@@ -873,7 +876,7 @@ def _log(
 
 
 def _numbers_up_to_the_last(path: Path, named: Collection[int], *, stated: bool) -> range:
-    """Return the images up to the last that is named; refuse numbers in steps, where no rate is stated."""
+    """Return the images up to the last listed one; refuse numbers in steps if no rate is given."""
     steps = _between(named)
     if len(named) < _LEAST_NUMBERS or steps.step == 1:
         return range(steps.stop)
@@ -885,6 +888,6 @@ def _numbers_up_to_the_last(path: Path, named: Collection[int], *, stated: bool)
 
 
 def frame_of_rows(rows: Sequence[Row]) -> DetectionFrame:
-    """Return the boxes of one image, a row each."""
+    """Return the boxes of one image, one per row."""
     boxes = np.array([row[0] for row in rows], dtype=np.float64).reshape(-1, 4)
     return DetectionFrame(boxes, np.array([row[1] for row in rows]), tuple(row[2] for row in rows))

@@ -1,6 +1,6 @@
-"""Detectors: of moving objects for a standing camera, by background subtraction, and a user's own ONNX model.
+"""Detectors: moving objects for a standing camera by background subtraction, and a user's own ONNX model.
 
-The output of a model is of YOLO's form.
+The output of a model has YOLO's form.
 """
 
 import io
@@ -18,25 +18,25 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageA
 from .box_linking import overlaps
 from .detections import MAX_BOXES_A_FRAME, DetectionFrame
 
-# No edge of an image is narrower: pixels have a size, and noise is smoothed before it is looked for.
+# No edge of an image is narrower: pixels have a size, and noise is smoothed before the search.
 NARROWEST_EDGE_PX = 3.0
-# MOG2's own: a pixel moves when it is so many variances from every mode of its background.
+# MOG2's default: a pixel moves if it is this many variances from every mode of its background.
 MOG2_VARIANCES = 16.0
 
 WIDTH_PX = 640  # Frames are reduced to this width first
-HISTORY = 100  # Frames that the background remembers
-WARM_UP = 5  # First frames, in which nothing is reported
+HISTORY = 100  # Number of frames in the background
+WARM_UP = 5  # First frames, which give no detections
 # Smallest difference that is motion, grey levels, Euclidean over the colours, > 0. The codec and the sensor
-# of a street camera scatter by some 3 grey levels a colour, 5 over three: three times that.
+# of a street camera have a noise of some 3 grey levels per colour, 5 over three: three times that.
 LEAST_CONTRAST = 15.0
 MIN_AREA = 0.0015  # Smallest object as a share of the image
 MAX_AREA = 0.6  # Larger regions are changes of the light
-# Widest edge of an object as a share of the image's width. A change without one on at least `OUTLINED` of its
-# outline is light: the glow of lamps, a cloud, or what a lens out of focus leaves.
+# Widest edge of an object as a share of the image's width. A change without an edge on at least `OUTLINED` of
+# its outline is light: the glow of lamps, a cloud, or the blur of a lens out of focus.
 EDGE_WIDTH = 0.01
-# 0 lets everything through. Below one half, as a car has no edge where it meets its shadow.
+# 0 accepts every region. The value is below one half, because a car has no edge at its shadow.
 OUTLINED = 0.25
-LABEL = "car"  # Of all boxes: background subtraction has no classes
+LABEL = "car"  # Label of all boxes: background subtraction has no classes
 # Smoothing against pixel noise in the gradient; far narrower than any edge width in use.
 _SMOOTHING_PX = 0.7
 # The contrast of a change is the level that it reaches over most of its area.
@@ -74,7 +74,7 @@ class MotionDetector:
         self._seen = 0
 
     def detect(self, frame: ImageArray, /) -> DetectionFrame:
-        """Return the moving objects; the score is the share of the box that moves.
+        """Return the moving objects; the score is the moving share of the box.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class MotionDetector:
         Raises
         ------
         InvalidArgumentError
-            If the frame is no image of uint8.
+            If the frame is not an image of uint8.
         """
         if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or not frame.size:
             raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
@@ -122,7 +122,7 @@ class MotionDetector:
         _, labels, stats, _ = self._cv2.connectedComponentsWithStats(mask, connectivity=8)
         share = stats[:, 4] / mask.size
         kept = (share >= MIN_AREA) & (share <= MAX_AREA)
-        kept[0] = False  # what does not move
+        kept[0] = False  # The static part
         numbers = np.flatnonzero(kept)
         if numbers.size:
             numbers = numbers[self._has_outline(frame, labels, numbers)]
@@ -131,14 +131,14 @@ class MotionDetector:
         return DetectionFrame(boxes, area / (width * height), (LABEL,) * numbers.size)
 
     def _has_outline(self, frame: ImageArray, labels: NDArray[np.int32], numbers: IntArray) -> BoolArray:
-        """Return which regions are objects and not changes of the light."""
+        """Return which regions are objects rather than changes of the light."""
         apart = _difference(frame, self._background.getBackgroundImage())
         width_px = max(EDGE_WIDTH * frame.shape[1], NARROWEST_EDGE_PX)
         return np.array([outlined_share(apart, labels == number, width_px) for number in numbers]) >= OUTLINED
 
 
 def reduced_to(frame: ImageArray, width_px: int) -> ImageArray:
-    """Return an image of at most so many columns, its shape kept."""
+    """Return an image with at most this width, its aspect ratio kept."""
     height, width = frame.shape[:2]
     if width <= width_px:
         return frame
@@ -159,10 +159,10 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
 
     .. math:: \max_{|q - p| \le w} |\nabla D(q)| \ge C / w,
 
-    with C the 75th percentile of the change D over the region. An edge that a lens smears by
-    :math:`\sigma` has the slope :math:`C / (\sigma \sqrt{2 \pi})`: it counts up to
-    :math:`\sigma \approx 0.4 w`. The glow of lamps on a wall, a passing cloud and a step of the exposure
-    change many pixels, but by less from each to the next.
+    with C the 75th percentile of the change D over the region. An edge that a lens blurs by :math:`\sigma`
+    has the slope :math:`C / (\sigma \sqrt{2 \pi})`: it is accepted up to :math:`\sigma \approx 0.4 w`. The
+    glow of lamps on a wall, a passing cloud and a step of the exposure change many pixels, but little between
+    neighbours.
 
     Shapes: apart (height, width), region (height, width).
     """
@@ -178,20 +178,20 @@ def outlined_share(apart: Float32Array, region: BoolArray, width_px: float) -> f
     return float(np.mean(steepest[outline] >= contrast / width_px))
 
 
-# ONNX files are protocol buffers, which end at 2 GiB.
+# ONNX files are protocol buffers, whose limit is 2 GiB.
 MAX_BYTES = 2 << 30
-MIN_SCORE = 0.25  # Lowest score that is reported
-MOST_OVERLAP = 0.5  # Of two boxes that overlap by more, the better one is kept
-SIDE_PX = 640  # Of the square that the model takes, where its input has no fixed size
-# Grey level of the border of a letterbox, that of YOLO's training.
+MIN_SCORE = 0.25  # Lowest score in the output
+MOST_OVERLAP = 0.5  # Of two boxes with a larger overlap, the better one is kept
+SIDE_PX = 640  # Side of the model's square input if it has no fixed size
+# Grey level of the border of a letterbox, as in YOLO's training.
 GREY = 114
 
 
 class OnnxDetector:
     """Run an ONNX model of YOLO's form on images.
 
-    The image is fitted into a square, the rest filled with grey, and passed as (1, 3, side, side), red first,
-    in [0, 1]. For the output see `decode_yolo`.
+    The image is fitted into a square, the rest is filled with grey, and the input has the shape (1, 3, side,
+    side), red first, in [0, 1]. For the output see `decode_yolo`.
 
     Parameters
     ----------
@@ -200,12 +200,12 @@ class OnnxDetector:
     labels : tuple of str
         Names of the classes in the order of the model, at least one.
     name : str
-        Of the model, for messages.
+        Name of the model, for messages.
 
     Raises
     ------
     InvalidArgumentError
-        If the model does not take one image, or no class is named.
+        If the model does not take one image, or no class name is given.
 
     Examples
     --------
@@ -238,7 +238,7 @@ class OnnxDetector:
         Parameters
         ----------
         frame : ndarray of uint8, shape (height, width, 3)
-            Blue first.
+            Image in the order blue, green, red.
 
         Returns
         -------
@@ -248,7 +248,7 @@ class OnnxDetector:
         Raises
         ------
         InvalidArgumentError
-            If the frame is no colour image or the model's output is not of YOLO's form.
+            If the frame is not a colour image or the model's output does not have YOLO's form.
         OwnPartError
             If the model fails.
         """
@@ -257,7 +257,7 @@ class OnnxDetector:
         tensor, scale = self._letterbox(frame)
         try:
             outputs = self._session.run(None, {self._input: tensor})
-        except Exception as error:  # onnxruntime raises bare classes of its own
+        except Exception as error:  # onnxruntime raises its own bare classes
             raise OwnPartError(self._name, error) from error
         boxes, scores, classes = decode_yolo(outputs[0], len(self._labels))
         limits = np.array([frame.shape[1], frame.shape[0]] * 2, dtype=np.float64)
@@ -276,7 +276,7 @@ class OnnxDetector:
     def _best(self, boxes: FloatArray, scores: FloatArray, classes: IntArray) -> DetectionFrame:
         kept = np.flatnonzero(scores >= MIN_SCORE)
         kept = kept[np.argsort(-scores[kept], kind="stable")][: 10 * MAX_BOXES_A_FRAME]
-        # Boxes of different classes never suppress each other: each class lies in a plane of its own.
+        # Each class has its own plane, so that boxes of different classes never suppress each other.
         planes = boxes[kept] + 1e5 * classes[kept, None]
         kept = kept[suppress(planes, scores[kept], MOST_OVERLAP)][:MAX_BOXES_A_FRAME]
         return DetectionFrame(boxes[kept], scores[kept], tuple(self._labels[c] for c in classes[kept]))
@@ -300,7 +300,7 @@ def open_onnx(path: str | Path, labels: tuple[str, ...]) -> OnnxDetector:
     Raises
     ------
     InputFileError
-        If it is missing, larger than 2 GiB, or no model that onnxruntime takes.
+        If the file is missing, larger than 2 GiB, or not a model for onnxruntime.
     MissingExtraError
         If onnxruntime is not installed.
 
@@ -320,22 +320,22 @@ def open_onnx(path: str | Path, labels: tuple[str, ...]) -> OnnxDetector:
         raise InputFileError(name, f"expected an ONNX model ({error.strerror})") from error
     onnxruntime = optional("onnxruntime")
     try:
-        with redirect_stdout(io.StringIO()):  # it prints that it tries again
+        with redirect_stdout(io.StringIO()):  # It prints its retries
             session = onnxruntime.InferenceSession(str(name), providers=["CPUExecutionProvider"])
         return OnnxDetector(session, labels, str(name))
-    except Exception as error:  # onnxruntime raises bare classes of its own
+    except Exception as error:  # onnxruntime raises its own bare classes
         told = " ".join(str(error).split())
         raise InputFileError(name, f"expected an ONNX detector, it does not open: {told}") from error
 
 
 def decode_yolo(output: NDArray[np.generic], classes: int) -> tuple[FloatArray, FloatArray, IntArray]:
-    r"""Turn the raw output of a YOLO model into boxes.
+    r"""Convert the raw output of a YOLO model into boxes.
 
     Shapes: returns (n, 4).
     """
     # Three forms are distinguished by their shape, with C classes and n candidates: (1, 4 + C, n), centre and
-    # size with a score a class; (1, n, 5 + C), with an objectness in front that multiplies them; (1, n, 6),
-    # corners, score and class, of a model that suppresses doubles itself. Six columns with one class are
+    # size with a score per class; (1, n, 5 + C), with an objectness in front that multiplies them; (1, n, 6),
+    # corners, score and class, of a model that suppresses duplicates itself. Six columns with one class are
     # read as the second.
     array = np.asarray(output, dtype=np.float64)
     if array.ndim != 3 or array.shape[0] != 1 or not np.isfinite(array).all():
