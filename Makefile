@@ -56,6 +56,7 @@ lint: $(VENV)/.test
 	$(BIN)/mypy -p worldstate
 	MYPYPATH=lab $(BIN)/mypy -p worldstate_lab
 	$(BIN)/lint-imports
+	$(BIN)/python tools/prose.py
 	$(BIN)/python -m pytest tests/house/test_docs.py -k "who or lines_of_a_page or glossary"
 
 # For use after a change of the types of snapshots or scenes.
