@@ -1,4 +1,4 @@
-"""A bearing votes for a side in proportion to how surely its sound is direct, and hides nothing else."""
+"""A bearing changes the likelihoods of the sides in proportion to P(direct sound)."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def of(values: tuple[float, ...]) -> SignatureEvidence:
 
 
 @given(st.tuples(*[likelihoods] * 4), bearings, chances)
-def test_it_raises_nothing_and_mirrors(
+def test_a_vote_raises_no_likelihood_and_is_symmetric(
     values: tuple[float, ...], bearing: tuple[float, float], d: float
 ) -> None:
     before, voted = of(values), with_bearing_vote(of(values), *bearing, d)
@@ -30,7 +30,9 @@ def test_it_raises_nothing_and_mirrors(
 
 
 @given(st.tuples(*[likelihoods] * 4), st.floats(0.2, 1.5))
-def test_sure_direct_sound_is_the_bearings(values: tuple[float, ...], azimuth: float) -> None:
+def test_certain_direct_sound_takes_the_side_of_its_bearing(
+    values: tuple[float, ...], azimuth: float
+) -> None:
     voted = with_bearing_vote(of(values), azimuth, 0.1, 1.0)
     assert voted.hidden[0] - voted.hidden[1] > 3.0
     assert logsumexp(voted.hidden) <= logsumexp([voted.visible, voted.none]) + 1e-9
@@ -42,7 +44,7 @@ def test_reflected_sound_changes_nothing(values: tuple[float, ...], bearing: tup
 
 
 @pytest.mark.parametrize("value", [0.05, 0.3, 0.6, 0.95])
-def test_direct_is_a_lone_peak_that_takes_most_of_the_sound(value: float) -> None:
+def test_a_single_strong_peak_is_direct_sound(value: float) -> None:
     lone, image = Peak(0.5, value, 8.0), Peak(-0.7, 0.8 * value, 6.4)
     assert (direct_probability([lone]) > 0.5) == (value > 0.45)
     assert direct_probability([lone, image]) == 0.0

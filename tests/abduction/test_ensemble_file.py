@@ -1,4 +1,4 @@
-"""Model files that hold an ensemble: trained by the command, read back to the bit, damage refused by name."""
+"""Model files with an ensemble: a written file reads back bit for bit, a damaged one raises an error."""
 
 import copy
 import json
@@ -17,7 +17,7 @@ from worldstate.adapters.files.model_file import (
     read_model,
     save_model,
 )
-from worldstate.ground.errors import InputFileError, WorldstateError
+from worldstate.ground.errors import WorldstateError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.operations.training.training import TrainingSettings, train_model
 
@@ -74,7 +74,7 @@ def test_no_row_of_the_data_is_written(default):
         assert not rows & {np.float64(value).tobytes() for value in np.ravel(expert["weights"])}
 
 
-def test_it_predicts_other_recordings_of_its_sites(model):
+def test_an_ensemble_predicts_other_recordings_of_its_sites(model):
     table = made_up_table(seed=2)
     other = FeatureTable(
         table.features, table.labels, table.ids, table.environments,
@@ -114,28 +114,3 @@ def test_wrong_values_are_refused_or_harmless(default, data, value):
         json.dumps(encode(changed), allow_nan=False)
         inputs = np.zeros((1, changed.signature.n_features))
         assert np.isfinite(changed.signature.predict_proba(inputs)).all()
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        ("home", 0),
-        ("class_prior", 0),
-        ("experts", 0),
-        ("experts", 0, "mean", 0),
-        ("experts", 0, "weights", 0, 0),
-    ],
-)
-@pytest.mark.parametrize("value", [None, "0.5", True, float("nan"), 10**400, [0.5]])
-def test_a_number_that_is_none_is_always_refused(default, path, value):
-    with pytest.raises(InputFileError):
-        read(replaced(default, ("signature", *path), value))
-
-
-def test_experts_that_do_not_fit_are_refused(default):
-    many = replaced(default, ("signature", "experts"), default["signature"]["experts"] * 20)
-    short = replaced(default, ("signature", "home"), default["signature"]["home"][:-6])
-    unknown = replaced(default, ("signature", "experts", 0, "view"), "colour")
-    for data, problem in ((many, "experts"), (short, "home"), (unknown, "view")):
-        with pytest.raises(InputFileError, match=problem):
-            read(data)

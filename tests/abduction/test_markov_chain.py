@@ -1,4 +1,4 @@
-"""Chains keep the distribution that they are balanced for, and priors are exchanged without loss."""
+"""Balanced chains keep their stationary distribution; a change of prior is reversible."""
 
 import numpy as np
 from hypothesis import given
@@ -32,7 +32,7 @@ def test_a_step_is_the_matrix_exponential_of_its_rates(
 
 
 @given(SEEDS)
-def test_a_posterior_moved_to_another_prior_and_back_is_itself(seed: int) -> None:
+def test_a_change_of_prior_is_reversible(seed: int) -> None:
     share, prior, said = 0.9 * np.random.default_rng(seed).dirichlet(np.ones(5), 3) + 0.02
     there = at_prior(said, share, prior)
     np.testing.assert_allclose(at_prior(there, prior, share), said / said.sum(), atol=1e-12)

@@ -1,4 +1,4 @@
-"""Kinds of road users as a softmax says them, in the model file and as sets of classes."""
+"""Kinds of road users: softmax probabilities, model files and sets of likely classes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ def model(seed: int = 0) -> RoadUserModel:
 
 
 @given(st.integers(0, 99), st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=2))
-def test_probabilities_are_those_of_a_softmax_under_their_names(seed: int, measured: list[float]) -> None:
+def test_class_probabilities_are_a_softmax(seed: int, measured: list[float]) -> None:
     one, x = model(seed), np.array(measured)
     expected = dict(zip(CLASSES, scipy.special.softmax(one.weights @ x + one.biases), strict=True))
     said = one.classify(x)
@@ -30,7 +30,7 @@ def test_probabilities_are_those_of_a_softmax_under_their_names(seed: int, measu
     assert dict(said) == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_class_of_share_zero_may_be_there_again() -> None:
+def test_a_class_recovers_from_a_share_of_zero() -> None:
     shares = np.array([0.5, 0.3, 0.2])
     one = replace(model(), shares=shares)
     again = one.with_shares(np.array([0.7, 0.0, 0.3])).with_shares(shares)
@@ -38,7 +38,7 @@ def test_a_class_of_share_zero_may_be_there_again() -> None:
 
 
 @given(st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3), st.floats(-5.0, 5.0), st.floats(0.05, 0.999))
-def test_no_smaller_set_reaches_the_mass_and_a_siren_takes_its_own(
+def test_the_likeliest_set_is_minimal_and_a_siren_keeps_its_odds(
     parts: list[float], log_odds: float, mass: float
 ) -> None:
     shares = tuple(zip(sorted(CLASSES), (np.array(parts) / sum(parts)).tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""A sequence model read hop by hop says what it says of the whole stream, from what a file can keep."""
+"""A sequence model applied hop by hop gives the posterior of the whole stream, also after a checkpoint."""
 
 import json
 
@@ -24,10 +24,10 @@ def _hops(whole: FloatArray) -> list[FloatArray]:
     return [whole[at : at + 1] for at in range(len(whole))]
 
 
-# Longer and shorter than the minute that is kept.
+# Shorter and longer than the minute of history that the reader keeps.
 @given(st.integers(0, 2**32 - 1), st.sampled_from([15, 60, 620]))
 @settings(max_examples=4)
-def test_hop_by_hop_it_says_what_the_model_says_of_the_whole_stream(seed: int, hops: int) -> None:
+def test_hop_by_hop_gives_the_posterior_of_the_whole_stream(seed: int, hops: int) -> None:
     rng = np.random.default_rng(seed)
     model, whole = sequence_model(rng), evidence_of(rng, hops)
     reader, said = SequenceReader(model), model.posterior(whole).groups
@@ -42,7 +42,7 @@ def test_hop_by_hop_it_says_what_the_model_says_of_the_whole_stream(seed: int, h
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=3)
-def test_a_history_from_a_file_goes_on_to_the_bit(seed: int) -> None:
+def test_a_reader_continues_bit_for_bit_from_a_saved_history(seed: int) -> None:
     rng = np.random.default_rng(seed)
     model, hops = sequence_model(rng), _hops(evidence_of(rng, 40))
     reader = SequenceReader(model)
@@ -58,7 +58,7 @@ def test_a_history_from_a_file_goes_on_to_the_bit(seed: int) -> None:
     assert isinstance(here, SequenceReading)
 
 
-def test_a_known_street_tells_the_sides_of_what_is_read() -> None:
+def test_a_known_street_corrects_the_sides_of_a_reading() -> None:
     rng = np.random.default_rng(5)
     model, hops = sequence_model(rng), _hops(evidence_of(rng, 12))
     known = SidePatterns("roof")

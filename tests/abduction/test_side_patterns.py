@@ -1,4 +1,4 @@
-"""What passes tell of how either arm sounds: against another discriminant, and where it may not speak."""
+"""Sound patterns of the two arms, learned from passes, against scikit-learn's discriminant."""
 
 import json
 import logging
@@ -23,7 +23,6 @@ from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.source import ListenSettings, open_source, street_listener
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, forgotten, with_pass
 
@@ -32,7 +31,7 @@ SLOPE = np.linspace(1.0, -1.0, SECTORS)
 
 
 def passes_of(rng: np.random.Generator, count: int, hops: int = 30) -> list[tuple[str, PassSound]]:
-    """Left ones louder on the left, right ones the other way round, and all of them noisy."""
+    """Return noisy passes that are louder on their own side."""
     arms = [("left", 1.0), ("right", -1.0)] * count
     sounds = [sign * 0.3 * SLOPE + rng.normal(0.0, 0.4, (hops, SECTORS)) for _, sign in arms]
     return [
@@ -48,7 +47,7 @@ def learned(passes: list[tuple[str, PassSound]]) -> SidePatterns:
     return known
 
 
-def test_of_many_passes_it_is_fishers_discriminant():
+def test_many_passes_give_fishers_discriminant():
     passes = passes_of(np.random.default_rng(0), 400)
     sides = learned(passes).sides()
     x = np.concatenate([sound.patterns for _, sound in passes])
@@ -61,7 +60,7 @@ def test_of_many_passes_it_is_fishers_discriminant():
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
-def test_whether_anybody_comes_stays_and_only_the_side_moves(seed: int) -> None:
+def test_patterns_change_the_side_and_not_the_existence(seed: int) -> None:
     rng = np.random.default_rng(seed)
     sides = learned(passes_of(rng, 3)).sides()
     groups, feature = rng.dirichlet(np.ones(len(GROUPS)), (5, 2)), rng.lognormal(0.0, 1.0, (5, 60))
@@ -78,7 +77,7 @@ def test_whether_anybody_comes_stays_and_only_the_side_moves(seed: int) -> None:
     np.testing.assert_allclose(odds(turned) - odds(groups), np.stack([told, -told], axis=1), atol=1e-6)
 
 
-def test_one_arm_alone_tells_no_side_and_more_passes_tell_more():
+def test_patterns_need_both_arms_and_gain_weight_with_passes():
     passes = passes_of(np.random.default_rng(2), 8)
     assert learned([one for one in passes if one[0] == "left"]).sides() is None
     of_the_left = np.exp(np.repeat(SLOPE, 5))[None]
@@ -86,14 +85,14 @@ def test_one_arm_alone_tells_no_side_and_more_passes_tell_more():
     assert 0.0 < told[0] < told[1] < 3.0
 
 
-def test_a_pass_that_nobody_heard_teaches_nothing():
+def test_a_silent_pass_changes_nothing():
     passes = passes_of(np.random.default_rng(3), 4)
     known = learned(passes)
     silent = PassSound(np.tile(SLOPE, (30, 1)), np.zeros(30), "roof")
     assert known.with_pass("right", silent) == known
 
 
-def test_another_array_begins_anew_and_its_model_leaves_it_out(caplog):
+def test_patterns_of_another_array_are_not_used(caplog):
     known = learned(passes_of(np.random.default_rng(4), 3))
     arm, sound = passes_of(np.random.default_rng(5), 1)[0]
     again = known.with_pass(arm, PassSound(sound.patterns, sound.weights, "bumper"))
@@ -107,20 +106,20 @@ def test_another_array_begins_anew_and_its_model_leaves_it_out(caplog):
 
 
 def heard_hop(rng: np.random.Generator, slope: float) -> tuple[np.ndarray, np.ndarray]:
-    """Somebody comes, and it is not known from where; loud on the left or on the right."""
+    """Return a hop with an approaching vehicle of unknown side, louder on one side."""
     groups = np.zeros((2, len(GROUPS)))
     groups[:, 3], groups[:, OTHER], groups[:, -1] = 0.4, 0.4, 0.2
     return groups, np.exp(np.repeat(slope * SLOPE, 5) + rng.normal(0.0, 0.3, 60))
 
 
 def told_of(listener: StreetListener, rng: np.random.Generator, slope: float, hops: int = 40) -> float:
-    """The chance that somebody comes from the left, by the last of some hops."""
+    """Return P(vehicle from the left) after some hops."""
     for _ in range(hops):
         groups = listener.turned(*heard_hop(rng, slope))
     return float(groups[0, 3])
 
 
-def test_who_comes_into_view_teaches_the_side_and_a_checkpoint_goes_on_to_the_bit():
+def test_hand_overs_teach_the_side_and_a_checkpoint_continues_bit_for_bit():
     rng = np.random.default_rng(8)
     listener = StreetListener(StreetHearing(SidePatterns("roof")))
     for arm, slope in (("left", 0.5), ("right", -0.5)) * 3:
@@ -138,7 +137,7 @@ def test_who_comes_into_view_teaches_the_side_and_a_checkpoint_goes_on_to_the_bi
     assert listener.hearing.known == again.hearing.known
 
 
-def test_for_three_seconds_after_a_vehicle_its_sound_is_turned_to_no_arm():
+def test_patterns_are_not_applied_for_three_seconds_after_a_pass():
     rng = np.random.default_rng(5)
     sound = {
         arm: PassSound(
@@ -157,7 +156,7 @@ def test_for_three_seconds_after_a_vehicle_its_sound_is_turned_to_no_arm():
     assert turned == [hop >= 29 for hop in range(31)]
 
 
-def test_in_the_company_of_the_other_arm_nobody_knows_whose_sound_it_is():
+def test_overlapping_passes_of_both_arms_teach_nothing():
     rng = np.random.default_rng(9)
     listener = StreetListener(StreetHearing(SidePatterns("roof")))
     told_of(listener, rng, 0.5)
@@ -174,13 +173,13 @@ def test_in_the_company_of_the_other_arm_nobody_knows_whose_sound_it_is():
 
 @pytest.mark.long
 @pytest.mark.parametrize("adapts", [True, False])
-def test_a_hand_over_is_a_lesson(adapts, approach):
+def test_a_hand_over_teaches_the_street(adapts, approach):
     settings = ListenSettings(site_adaptation=adapts)
     *_, last = listen_steps(open_source(approach.folder, settings=settings))
     assert (sum(last.checkpoint.street.known.weights) > 0.0) == adapts
 
 
-def test_a_street_keeps_them_and_forgets_slowly():
+def test_a_street_keeps_patterns_and_forgets_them_slowly():
     street = LearnedStreet()
     for arm, sound in passes_of(np.random.default_rng(6), 3):
         street = with_pass(street, StreetPass(arm, None, None, sound=sound))
@@ -189,11 +188,6 @@ def test_a_street_keeps_them_and_forgets_slowly():
     assert later.sides().certainty < street.patterns.sides().certainty
 
 
-def test_patterns_of_other_sectors_are_refused():
-    with pytest.raises(InvalidArgumentError, match="12 sectors"):
-        SidePatterns(sums=((0.0,), (0.0,)))
-
-
-def test_a_pattern_does_not_know_how_loud_it_was():
+def test_a_pattern_does_not_depend_on_the_level():
     feature = np.random.default_rng(7).lognormal(0.0, 1.0, (4, 60))
     np.testing.assert_allclose(arrival_pattern(7.0 * feature), arrival_pattern(feature), atol=1e-12)

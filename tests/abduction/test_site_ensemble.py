@@ -1,6 +1,5 @@
-"""The ensemble for unseen junctions: mirror law, references from elsewhere, optimal coefficients."""
+"""The ensemble for unseen junctions: mirror law, site references, optimal coefficients."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +10,6 @@ from scipy.special import log_softmax
 
 from worldstate.abduction.signature.ensemble import (
     KINDS,
-    VIEWS,
-    EnsembleModel,
     expert_views,
     log_levels,
     mirror_features,
@@ -27,11 +24,11 @@ from worldstate.abduction.signature.ensemble_training import (
     SimulatedWindows,
     SiteEnsembleClassifier,
 )
-from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings
+from worldstate.abduction.signature.site_estimate import SiteEstimate
 from worldstate.abduction.signature.window_classes import CLASSES, WINDOW_CLASSES, mirrored_classes
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import decode, encode
+from worldstate.ground.serialisation import encode
 from worldstate.operations.training.site_references import (
     learned_while_listening,
     with_site_references,
@@ -40,7 +37,7 @@ from worldstate.operations.training.training import fit_ensemble
 
 
 def windows(rng, n=200, spread=0.8):
-    """Four overlapping classes at two sites of different level, with the sites' references behind."""
+    """Return features of four overlapping classes at two sites of different level, with site references."""
     labels = rng.permutation(np.repeat(CLASSES, n // 4))
     azimuth = np.tile(np.linspace(-1, 1, 30), 2)
     shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
@@ -75,7 +72,7 @@ def test_mirroring_the_world_exchanges_the_sides(trained, classes):
     there, back = model.evidence(X[0]), model.evidence(mirrored(X)[0])
     assert there.hidden == back.hidden[::-1]
     assert there.sides.log_ratios == back.sides.log_ratios[::-1]
-    # Without a reference too: that of the training sites is symmetric.
+    # Also without a reference: the mean of the training sites is symmetric.
     plain = X[:, :60]
     np.testing.assert_allclose(
         model.predict_proba(mirrored(plain))[:, image], model.predict_proba(plain), atol=1e-9
@@ -128,13 +125,13 @@ def test_a_site_that_is_not_trained_on_is_left_out_of_the_simulated_windows_too(
     )
     assert encode(with_all) == encode(with_some)
     assert np.abs(with_all.predict_proba(X) - without.predict_proba(X)).max() > 0.01
-    # What stands in for a site, and how fast one is learned, is of real windows alone.
+    # The default reference and the learning rate of a site depend on real windows only.
     np.testing.assert_array_equal(with_all.home, without.home)
     assert with_all.prior_s == without.prior_s
 
 
-def test_a_window_is_learned_compared_with_what_was_heard_before_it_too():
-    """Before anything was heard that is the training sites' mean: the same as windows of no street beside."""
+def test_training_adds_windows_with_the_estimated_reference():
+    """With no history the reference is the mean of the training sites, as for windows without a site."""
     X, y = windows(np.random.default_rng(12))
     groups, nothing = np.tile(["SA1", "SA2"], 100), SiteEstimate.start(60)
     nowhere = np.hstack([X[:, :60], np.full((len(X), 180), np.nan)])
@@ -144,25 +141,13 @@ def test_a_window_is_learned_compared_with_what_was_heard_before_it_too():
     heard = SiteEnsembleClassifier().fit(X, y, groups, [nothing] * len(X)).model_
     np.testing.assert_allclose(heard.predict_proba(X), twice.predict_proba(X), atol=1e-4)
     np.testing.assert_allclose(heard.class_prior, twice.class_prior, rtol=1e-12)
-    # What stands in for a site is of the references behind the windows alone, and each window weighs one.
+    # The default reference depends only on the site references, and each window has weight one.
     plain = SiteEnsembleClassifier().fit(X, y, groups).model_
     np.testing.assert_array_equal(heard.home, plain.home)
     assert np.abs(heard.predict_proba(X) - plain.predict_proba(X)).max() > 0.01
 
 
-def test_what_was_heard_is_compared_as_in_use():
-    """The reference of an estimate is the same from a model as from what its fit is made of."""
-    rng = np.random.default_rng(13)
-    model = SiteEnsembleClassifier().fit(*windows(rng)).model_
-    one = SiteEstimate.start(60).updated(rng.uniform(0.1, 1.0, 60), 1.0, SiteEstimateSettings())
-    there = one.beside(model.home, model.empty, model.prior_s)
-    np.testing.assert_array_equal(one.reference(model), there)
-    assert not np.allclose(there, model.home)
-    with pytest.raises(InvalidArgumentError, match="60"):
-        SiteEstimate.start(30).beside(model.home, model.empty, model.prior_s)
-
-
-def test_a_moving_ego_holds_its_level_views_back_less():
+def test_level_views_have_larger_weights_for_a_moving_ego():
     labels, _, recordings, features = made_up_junctions()
     models = {}
     for kind in ("S", "D"):
@@ -177,8 +162,8 @@ def test_a_moving_ego_holds_its_level_views_back_less():
         assert ratio > 1.05 if recipe.view in KINDS else ratio == pytest.approx(1.0)
 
 
-def test_streets_that_a_table_does_not_have_are_learned_whatever_is_held_out():
-    """Drawn junctions have names of their own: learned beside real ones, windows of them were dropped."""
+def test_simulated_junctions_stay_whichever_site_is_held_out():
+    """Simulated junctions have their own names; windows of them were once dropped beside real ones."""
     rng = np.random.default_rng(9)
     X, y = windows(rng)
     groups = np.tile(["SA1", "SA2"], 100)
@@ -190,8 +175,8 @@ def test_streets_that_a_table_does_not_have_are_learned_whatever_is_held_out():
 
 
 @pytest.mark.parametrize("other_side", [0.0, OTHER_SIDE])
-def test_a_part_of_a_simulated_hazard_says_the_other_side(other_side):
-    # Three windows of one pattern, of which real ones say nothing: the posterior is the share, by weight.
+def test_a_share_of_a_simulated_hazard_is_labelled_with_the_other_side(other_side):
+    # One pattern that no real window has: the posterior is the share of each label by weight.
     rng, n = np.random.default_rng(9), 300
     X, y = windows(rng, n)
     X, sites = X[y != "left"], np.repeat("SA1", n - n // 4)
@@ -207,14 +192,14 @@ def test_a_part_of_a_simulated_hazard_says_the_other_side(other_side):
     )
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
     assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.5, 0.5], abs=0.02)
-    # Both sides are as likely since the pattern is its own mirror image; of another the share is seen.
+    # This pattern is symmetric, so both sides are equally likely. An asymmetric one shows the share.
     left[:, :20] = 400.0
     more = replace(more, X=np.concatenate([left, rest]))
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
     assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([1.0 - other_side, other_side], abs=0.05)
 
 
-def test_the_reference_of_another_site_matters(trained):
+def test_another_site_reference_changes_the_prediction(trained):
     X, _, model = trained
     moved = replace(model, home=model.home + 0.5)
     assert np.abs(moved.predict_proba(X[:, :60]) - model.predict_proba(X[:, :60])).max() > 0.05
@@ -241,7 +226,7 @@ def test_the_coefficients_are_the_optimum_of_the_penalised_likelihood(trained):
             assert loss(expert.weights + step) > best
 
 
-def test_shape_features_mirror_as_they_should():
+def test_shape_features_of_a_mirrored_window_are_mirrored():
     levels = np.random.default_rng(4).normal(size=(50, 60))
     ours, theirs = shape_features(levels), shape_features(mirror_features(levels))
     for segment in (0, 13):
@@ -259,7 +244,7 @@ def table(labels, environments, recordings, features):
     )
 
 
-def test_a_reference_never_holds_the_recording_that_is_scored_nor_another_site_nor_a_label():
+def test_a_reference_excludes_its_recording_other_sites_and_labels():
     rng = np.random.default_rng(5)
     n = 40
     labels = rng.choice(CLASSES, n).tolist()
@@ -287,7 +272,7 @@ def made_up_junctions():
 
 @settings(max_examples=8)
 @given(st.integers(0, 44), st.sampled_from(["none", "left", "right"]))
-def test_what_a_stream_taught_holds_nothing_of_the_recording_that_is_scored(recording, label):
+def test_a_learned_reference_excludes_the_scored_recording(recording, label):
     labels, sites, recordings, features = made_up_junctions()
     before = learned_while_listening(
         table(labels, sites, recordings, features), np.random.default_rng(recording)
@@ -302,7 +287,7 @@ def test_what_a_stream_taught_holds_nothing_of_the_recording_that_is_scored(reco
         np.testing.assert_array_equal(before[row].level, after[row].level)
 
 
-def test_without_an_empty_window_elsewhere_nothing_was_heard_or_it_is_an_error():
+def test_learning_needs_hazard_free_windows_or_starts_empty():
     labels, sites, recordings, features = made_up_junctions()
     labels = ["left" if name == "none" else name for name in labels]
     streets = table(labels, sites, recordings, features)
@@ -315,18 +300,11 @@ def test_without_an_empty_window_elsewhere_nothing_was_heard_or_it_is_an_error()
 def test_a_stream_is_ten_windows_of_mostly_empty_street():
     labels, sites, recordings, features = made_up_junctions()
     features[:] = np.where(np.array(labels) == "left", np.e, 1.0)[:, None]
-    # Nobody has heard a car in view: a stream that is half front would show here.
+    # NaN would show if windows of a visible car entered the stream.
     features[np.array(labels) == "front"] = np.nan
     learned = learned_while_listening(table(labels, sites, recordings, features), np.random.default_rng(0))
     assert learned[0].heard_s == pytest.approx(10.0, rel=0.05)
     assert np.mean([one.level.mean() for one in learned]) == pytest.approx(0.05, abs=0.03)
-
-
-def test_cold_is_the_mean_of_the_training_sites(trained):
-    X, _, model = trained
-    cold = X[:4, :60]
-    behind = np.hstack([X[:4, :60], np.tile(model.home, (4, 1))])
-    np.testing.assert_allclose(model.predict_proba(cold), model.predict_proba(behind), rtol=1e-12)
 
 
 def test_a_site_with_one_recording_has_no_reference():
@@ -340,32 +318,11 @@ def test_quiet_is_the_mean_of_the_quietest_third():
     np.testing.assert_allclose(reference, np.repeat([9.5, 9.5, levels[:7, 0].mean()], 2))
 
 
-def test_a_model_reads_back_to_the_bit(trained):
-    X, _, model = trained
-    again = decode(EnsembleModel, json.loads(json.dumps(encode(model), allow_nan=False)), "file")
-    np.testing.assert_array_equal(again.predict_proba(X), model.predict_proba(X))
-
-
-def test_nothing_is_drawn(trained):
+def test_training_is_deterministic(trained):
     X, y, model = trained
     assert encode(SiteEnsembleClassifier().fit(X, y).model_) == encode(model)
 
 
-def test_likelihoods_stay_finite_far_from_all_that_was_seen(trained):
+def test_likelihoods_are_finite_far_from_the_training_data(trained):
     for level in (0.0, 1e-30, 1.0, 1e30):
         assert np.isfinite(trained[2].evidence(np.full(60, level)).log_likelihoods).all()
-
-
-@pytest.mark.parametrize("X", [np.zeros((3, 59)), np.zeros(60), np.full((1, 60), np.nan), np.zeros((1, 180))])
-def test_other_features_are_refused(trained, X):
-    with pytest.raises(InvalidArgumentError, match="X"):
-        trained[2].predict_proba(X)
-
-
-def test_training_needs_references_and_its_classes():
-    X, y = windows(np.random.default_rng(6))
-    with pytest.raises(InvalidArgumentError, match="reference"):
-        SiteEnsembleClassifier().fit(X[:, :61], y)
-    with pytest.raises(InvalidArgumentError, match="classes"):
-        SiteEnsembleClassifier().fit(X, np.where(y == "none", "left", y))
-    assert set(VIEWS) >= {recipe.view for recipe in RECIPES}
