@@ -12,7 +12,7 @@ from worldstate.frontend.stream import FrontEnd
 
 @pytest.fixture(autouse=True)
 def _of_now() -> None:
-    """Look for libraries anew: what an earlier test has loaded since brings a BLAS of its own."""
+    """Search for BLAS libraries again, because an earlier test may have loaded another one."""
     limits._controller.cache_clear()
 
 

@@ -1,4 +1,4 @@
-"""What one microphone hears, in numbers: oracles are signals whose modulation and lines are known."""
+"""Measures of the sound of one microphone, tested on signals of known modulation and tones."""
 
 import numpy as np
 import pytest
@@ -44,13 +44,13 @@ def test_no_measure_depends_on_the_level(gain_db: float) -> None:
     st.sampled_from([(2.0, "1.3", "0.4"), (4.0, "2.8", "2.2"), (12.5, "10.2", "8.2"), (22.0, "16.2", "16.2")])
 )
 @settings(max_examples=4, deadline=None)
-def test_modulation_is_found_at_its_rate_and_in_all_bands_at_once(case: tuple[float, str, str]) -> None:
+def test_modulation_is_found_at_its_rate_and_across_bands(case: tuple[float, str, str]) -> None:
     rate_hz, group, shared = case
     found = heard(noise() * (1.05 + np.sin(2.0 * np.pi * rate_hz * time())))
     still = heard(noise())
     rises = {name: found[name] - still[name] for name in MEASURES if name.startswith("modulation high")}
     assert max(rises, key=lambda name: rises[name]) == f"modulation high {group}"
-    # Eight bands that rise and fall as one have eight times the share of eight that do so by themselves.
+    # Eight bands with common modulation have eight times the share of independent ones.
     assert found[f"together {shared}"] > np.log(4.0)
     assert max(still[name] for name in MEASURES if name.startswith("together")) < np.log(2.5)
 
@@ -78,11 +78,11 @@ def test_a_comb_of_harmonics_stands_out_of_noise() -> None:
 def test_another_sample_rate_measures_the_same(rate_hz: float) -> None:
     sound = noise() * (1.05 + np.sin(2.0 * np.pi * 4.0 * time())) + np.sin(2.0 * np.pi * 700.0 * time())
     there, here = heard(resample_poly(sound, int(rate_hz / 1000), 6), rate_hz), heard(sound)
-    # The one holds its band filter's length back, so that their windows differ by some milliseconds.
+    # The band filter delays one of them, so their windows differ by some milliseconds.
     assert {name: value for name, value in there.items() if abs(value - here[name]) > 0.35} == {}
 
 
-def test_bands_share_a_level_that_they_do_not_depend_on() -> None:
+def test_band_levels_are_relative_to_their_mean() -> None:
     found = heard(noise() + 3.0 * np.sin(2.0 * np.pi * 650.0 * time()))
     bands = {name: found[name] for name in BANDS}
     assert max(bands, key=lambda name: bands[name]) == "band 580"

@@ -1,4 +1,4 @@
-"""Array files: Acoular reads the same places, and what is written comes back."""
+"""Array files: Acoular reads the same positions, and written files read back exactly."""
 
 from pathlib import Path
 

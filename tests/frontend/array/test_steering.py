@@ -1,4 +1,4 @@
-"""Power at a few directions says it at all."""
+"""Power at a few directions determines the power at all directions."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -30,7 +30,7 @@ def heard(rng: np.random.Generator, azimuths_deg: list[float], snr: float, frame
 
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), planar=st.booleans(), span=st.floats(0.2, 3.1))
-def test_any_quadratic_form_is_said_by_its_nodes(seed: int, planar: bool, span: float) -> None:
+def test_a_quadratic_form_is_interpolated_from_its_nodes(seed: int, planar: bool, span: float) -> None:
     rng = np.random.default_rng(seed)
     places = rng.uniform(-0.3, 0.3, (8, 3)) * [0.0 if planar else 1.0, 1.0, 1.0]
     vectors = MicrophoneArray(places).steering([400.0, 900.0], np.linspace(-span, span, 151))
@@ -48,7 +48,7 @@ def test_too_coarse_a_grid_has_no_nodes() -> None:
     assert interpolation_nodes(ROOF.steering([1500.0], np.radians(np.linspace(-90, 90, 15)))) is None
 
 
-def test_the_roof_needs_few_and_its_power_is_that_of_every_beam() -> None:
+def test_the_roof_array_needs_few_nodes_for_the_power_of_all_beams() -> None:
     assert BEAMS.nodes is not None
     assert BEAMS.nodes[0].weights.shape[2] <= 32
     spectra = heard(np.random.default_rng(0), [20.0], 3.0)

@@ -1,4 +1,4 @@
-"""What a bearing states: its error where a source is, and nothing where only noise is."""
+"""The stated error of a bearing: correct for a single source, large for noise alone."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.typing import FloatArray
 
 RATE = 6000
-# Well apart in OVAD's array: the two rows of four differ in height, none lies above another.
+# Wide spacing as in OVAD's array: two rows of different height, no microphone above another.
 FOUR = MicrophoneArray([[0, 0.41, 0.3], [0, -0.28, 0.3], [0, -0.37, -0.3], [0, 0.25, -0.3]])
 SPREAD = {
     56: ovad_array(),
@@ -46,7 +46,7 @@ def hear(array: MicrophoneArray, sound: FloatArray) -> list[AcousticFrame]:
 @pytest.mark.long
 @pytest.mark.parametrize("microphones", SPREAD)
 @pytest.mark.parametrize("kind", ["white", "diffuse"])
-def test_a_bearing_of_noise_is_not_called_sharp(kind: str, microphones: int) -> None:
+def test_a_bearing_of_noise_has_a_large_error(kind: str, microphones: int) -> None:
     array, rng = SPREAD[microphones], np.random.default_rng(1)
     white = rng.standard_normal((4 * RATE, microphones))
     frames = hear(array, diffuse(array, 3, 1) if kind == "diffuse" else white)
@@ -56,7 +56,7 @@ def test_a_bearing_of_noise_is_not_called_sharp(kind: str, microphones: int) -> 
     assert np.median(stated) > 30.0
 
 
-def test_the_error_of_a_lone_source_is_what_is_stated() -> None:
+def test_the_stated_error_of_a_single_source_is_correct() -> None:
     """Drawn arrays, directions and 3 to 25 dB of noise that is independent between microphones."""
     scores, n = [], round(1.1 * RATE)
     for seed in range(40):
@@ -72,8 +72,8 @@ def test_the_error_of_a_lone_source_is_what_is_stated() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.3
 
 
-def test_bearings_that_contradict_one_another_are_stated_wider() -> None:
-    """Two sources that sound in turn, as where a wall reflects; a lone one keeps what it states."""
+def test_contradicting_bearings_have_a_larger_error() -> None:
+    """Two sources in turn, as with a reflecting wall, widen the error; a single source keeps it."""
     array, n = SPREAD[14], 4 * RATE
     lone, other = wave(array, 30.0, 0.0, n, 6), wave(array, -20.0, 0.0, n, 7)
     first = (np.arange(n) // (RATE // 2) % 2 == 0)[:, None]
@@ -81,8 +81,8 @@ def test_bearings_that_contradict_one_another_are_stated_wider() -> None:
     assert hear(array, np.where(first, lone, other))[-1].bearing_std_rad > np.radians(25.0)
 
 
-def test_sharp_bearings_that_agree_do_not_outweigh_contradictions() -> None:
-    """A steady image in a wall, stated a degree sharp, after bearings 60 degrees apart, stated 15 degrees."""
+def test_agreeing_bearings_do_not_hide_earlier_contradictions() -> None:
+    """A steady reflection with an error of 1 degree follows bearings 60 degrees apart with 15 degrees."""
     scatter = BearingScatter(most_rad=np.radians(52.0))
     degrees = [0.0, 60.0] * 15 + [0.0] * 30
     stated = [scatter.widened(AcousticBearing(np.radians(d), np.radians(15 - 14 * (k >= 30)), 2.0)).std_rad
@@ -93,7 +93,7 @@ def test_sharp_bearings_that_agree_do_not_outweigh_contradictions() -> None:
 
 @pytest.mark.parametrize("microphones", SPREAD)
 def test_a_source_below_the_horizon_keeps_its_azimuth(microphones: int) -> None:
-    """Tyres 8 m ahead of a roof: at the horizon alone, four microphones were 40 degrees off."""
+    """Tyres 8 m ahead of a roof array: a search at the horizon alone was 40 degrees off."""
     array = SPREAD[microphones]
     rng = np.random.default_rng(2)
     for azimuth in (-50.0, -10.0, 30.0):
@@ -103,7 +103,7 @@ def test_a_source_below_the_horizon_keeps_its_azimuth(microphones: int) -> None:
 
 
 @pytest.mark.parametrize("microphones", SPREAD)
-def test_of_two_equal_sources_the_other_is_within_what_is_stated(microphones: int) -> None:
+def test_the_error_covers_both_of_two_equal_sources(microphones: int) -> None:
     array = SPREAD[microphones]
     lone, other = wave(array, 35.0, 0.0, RATE, 4), wave(array, -35.0, 0.0, RATE, 5)
     (alone,), (both,), (weak,) = (hear(array, lone + gain * other) for gain in (0.0, 1.0, 0.3))

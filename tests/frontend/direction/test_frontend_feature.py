@@ -9,7 +9,6 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.frontend.direction.feature import feature_steering, pair_sum, published_feature
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground.errors import InvalidArgumentError
 
 RATE = 47_998
 RIGHT_POSITIVE_DEG = np.linspace(-90.0, 90.0, 30)
@@ -71,15 +70,6 @@ def test_stream_equals_the_plain_formula_on_the_frames_that_end_in_each_half() -
     np.testing.assert_allclose(frame.feature, plain_feature(halves, array.positions_m, RATE), rtol=1e-4)
 
 
-def test_stream_and_whole_window_agree_on_the_roof_array() -> None:
-    array = roof_array_56()
-    sound = street(array, 2)
-    stream = FrontEnd(array, RATE).process(sound)[0].feature
-    whole = published_feature(sound, array, RATE)
-    assert np.abs(stream / whole - 1).max() < 0.03
-    assert np.corrcoef(stream, whole)[0, 1] > 0.9995
-
-
 def test_twice_the_real_part_plus_the_diagonal_is_pyroomacoustics() -> None:
     array = roof_array_56()
     frames = StreamingStft(56, 512, range(0, 257)).push(street(array, 4, seconds=0.2))
@@ -93,7 +83,7 @@ def test_twice_the_real_part_plus_the_diagonal_is_pyroomacoustics() -> None:
     np.testing.assert_allclose(expected, peer.grid.values, rtol=1e-4)
 
 
-def test_a_source_to_the_left_stands_in_the_first_half_of_a_segment() -> None:
+def test_a_source_on_the_left_is_in_the_first_half_of_a_segment() -> None:
     feature = published_feature(street(roof_array_56(), 5), roof_array_56(), RATE).reshape(2, 30)
     assert feature.min() >= 0
     assert feature.max() <= 1
@@ -108,13 +98,3 @@ def test_other_rates_agree_too(rate: int) -> None:
     stream = FrontEnd(array, rate).process(sound)[0].feature
     whole = published_feature(sound, array, rate)
     assert np.corrcoef(stream, whole)[0, 1] > 0.99
-
-
-def test_bad_windows_are_refused() -> None:
-    array = small_array()
-    with pytest.raises(InvalidArgumentError, match="window"):
-        published_feature(np.zeros((48_000, 6)), array, RATE)
-    with pytest.raises(InvalidArgumentError, match="512 samples"):
-        published_feature(np.zeros((511, 7)), array, RATE)
-    with pytest.raises(InvalidArgumentError, match="finite"):
-        published_feature(np.full((600, 7), np.nan), array, RATE)

@@ -1,4 +1,4 @@
-"""Misbehaving microphones: found, named, left out; and none found where there is none."""
+"""Faulty microphones are found, classified and left out; healthy arrays raise no fault."""
 
 import gc
 import tracemalloc
@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray, roof_array_56
+from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.health.channel_health import ArrayHealth, DropoutFinder
 from worldstate.frontend.health.channel_monitor import ClippingCounter
-from worldstate.frontend.health.geometry_check import position_scores, position_weights
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
 from worldstate.ground.values import NotUsable
@@ -116,13 +115,13 @@ FAULTS: list[tuple[Callable[[np.ndarray, np.random.Generator], None], dict[str, 
 @pytest.mark.long
 @pytest.mark.parametrize(("spoil", "expected", "masked"), FAULTS, ids=[f[0].__name__ for f in FAULTS])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_every_fault_is_named_and_nothing_else(
+def test_exactly_the_faults_present_are_found(
     spoil: Callable[[np.ndarray, np.random.Generator], None],
     expected: dict[str, list[int]],
     masked: bool,
     seed: int,
 ) -> None:
-    # A gain that is none of a gust takes six seconds to tell.
+    # It takes six seconds to distinguish a gain from a gust.
     sound = street(HALF, seed, seconds=6.5 if spoil is gain else SECONDS)
     spoil(sound, np.random.default_rng(50 + seed))
     last = healths(HALF, sound)[-1]
@@ -132,14 +131,14 @@ def test_every_fault_is_named_and_nothing_else(
     assert last.n_dropouts == 0
 
 
-def test_a_swap_says_where_the_channels_belong() -> None:
+def test_a_swap_has_the_right_channel() -> None:
     sound = street(HALF, 3)
     swap(sound, np.random.default_rng(0))
     faults = healths(HALF, sound)[-1].faults
     assert {(fault.channel, fault.looks_like) for fault in faults} == {(1, 22), (22, 1)}
 
 
-def test_all_at_once() -> None:
+def test_several_faults_at_once_are_found() -> None:
     sound = street(ROOF, 4)
     rng = np.random.default_rng(44)
     sound[:, [7, 40]] = sound[:, [40, 7]]
@@ -178,7 +177,7 @@ def test_coarse_quantisation_is_no_clipping(levels: int) -> None:
     assert all(health.is_healthy for health in healths(HALF, sound))
 
 
-def test_noise_of_their_own_is_not_judged() -> None:
+def test_independent_noise_is_not_classified() -> None:
     sound = np.random.default_rng(0).standard_normal((3 * RATE, 8))
     last = healths(MicrophoneArray(ROOF.positions_m[:8]), sound)[-1]
     assert last.is_healthy
@@ -193,7 +192,7 @@ def test_silence_is_dead_after_a_second() -> None:
 
 
 @pytest.mark.long
-def test_a_channel_that_dies_is_left_out_at_once_and_comes_back() -> None:
+def test_a_dead_channel_is_masked_at_once_and_returns() -> None:
     sound = street(HALF, 9, seconds=9.0)
     sound[: 2 * RATE, 4] = 0.0
     found = healths(HALF, sound)
@@ -205,7 +204,7 @@ def test_a_channel_that_dies_is_left_out_at_once_and_comes_back() -> None:
 
 
 def moving_source(array: MicrophoneArray, seconds: float, seed: int) -> tuple[np.ndarray, Callable]:
-    """A car at 10 m/s, 10 m ahead, from left to right, exactly retarded, (n, M); its azimuth heard at t."""
+    """Return the sound (n, M) of a car at 10 m/s, 10 m ahead, and its azimuth at emission."""
     from scipy.interpolate import CubicSpline
 
     rate, c, rng = 48_000, 343.0, np.random.default_rng(seed)
@@ -273,7 +272,7 @@ def test_leaving_out_noise_keeps_the_bearing() -> None:
 @pytest.mark.long
 @settings(deadline=None, max_examples=5)
 @given(dead=st.sets(st.integers(0, 27), max_size=20), seed=st.integers(0, 99))
-def test_leaving_out_is_listening_with_the_rest(dead: set[int], seed: int) -> None:
+def test_a_mask_equals_the_array_without_those_channels(dead: set[int], seed: int) -> None:
     sound = street(HALF, seed, seconds=1.3)
     rest = np.setdiff1d(np.arange(28), list(dead))
     sound[:, list(dead)] = 0.0
@@ -284,7 +283,7 @@ def test_leaving_out_is_listening_with_the_rest(dead: set[int], seed: int) -> No
     assert ours.bearing_rad == pytest.approx(theirs.bearing_rad, abs=1e-4)
 
 
-def test_clipping_costs_no_bearing_and_so_no_microphone() -> None:
+def test_clipped_microphones_stay_in_use() -> None:
     sound, azimuth = moving_source(ROOF, 1.6, seed=3)
     clean = rms_deg(FrontEnd(ROOF, 48_000).process(sound), azimuth)
     clipped = np.random.default_rng(3).choice(56, 20, replace=False)
@@ -295,7 +294,7 @@ def test_clipping_costs_no_bearing_and_so_no_microphone() -> None:
     assert rms_deg(frames, azimuth) < clean + 0.1
 
 
-def test_a_channel_that_dies_makes_no_step_in_looming_and_levels() -> None:
+def test_a_dying_channel_causes_no_step_in_looming_and_levels() -> None:
     array = MicrophoneArray(ROOF.positions_m[::8])
     time = np.arange(2 * RATE) / RATE
     sound = street(array, 11, seconds=2.0, waves=1) / (30.0 - 10.0 * time)[:, None].astype(np.float32)
@@ -365,7 +364,7 @@ def test_memory_does_not_grow_over_an_hour() -> None:
     assert max(traced[30:]) - traced[5] < 100_000
 
 
-def test_gaps_are_found_where_they_are() -> None:
+def test_dropouts_are_found_at_their_samples() -> None:
     sound = street(HALF, 14, seconds=6.0, slope=2.0)
     cut = np.delete(sound, np.arange(30_000, 30_777), axis=0)
     cut[50_000:50_300] = cut[49_999]
@@ -374,7 +373,7 @@ def test_gaps_are_found_where_they_are() -> None:
     assert last.faults == ()
     splices = [dropout.sample for dropout in last.dropouts if dropout.kind == "splice"]
     assert splices[0] == pytest.approx(30_000, abs=1)
-    # The ends of a repeat are cuts, too.
+    # Both ends of a repeat are splices as well.
     assert all(min(abs(s - 70_000), abs(s - 70_800)) <= 1 for s in splices[1:])
     assert [(dropout.sample, dropout.n_samples) for dropout in last.dropouts if dropout.kind == "still"] == [
         (49_999, 301)
@@ -385,7 +384,7 @@ def test_gaps_are_found_where_they_are() -> None:
 
 @pytest.mark.slow
 def test_four_cuts_in_five_are_found_in_simulated_streets() -> None:
-    """Pooled over streets with and without a vehicle; .86 of them, more where nothing drives."""
+    """Pooled over streets with and without a vehicle: 86 %, more without a vehicle."""
     array = MicrophoneArray(roof_array_56().positions_m[::4])
     found = 0
     for seed, approach in product(range(3, 7), ("left", "none")):
@@ -403,9 +402,7 @@ def test_four_cuts_in_five_are_found_in_simulated_streets() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(period=st.floats(60, 400), amplitude=st.floats(200, 3e4), limit=st.floats(0.3, 0.9))
-def test_a_clipped_wave_is_clipped_and_a_whole_one_is_not(
-    period: float, amplitude: float, limit: float
-) -> None:
+def test_only_a_clipped_wave_is_counted_as_clipped(period: float, amplitude: float, limit: float) -> None:
     rng = np.random.default_rng(0)
     wave = amplitude * (np.sin(2 * np.pi * np.arange(9600) / period) + 0.1 * rng.standard_normal(9600))
     both = np.round(np.stack([wave, wave.clip(-9e9, limit * amplitude)], axis=1)).astype(np.float32)
@@ -417,48 +414,7 @@ def test_a_clipped_wave_is_clipped_and_a_whole_one_is_not(
     assert share[1] > 0.03
 
 
-def test_place_weights_are_the_best_linear_guess_of_the_others() -> None:
-    array, f = MicrophoneArray(ROOF.positions_m[::7]), np.array([400.0, 1200.0])
-    usable = np.arange(8) != 2
-    weights = position_weights(array, f, usable)
-    distance = np.linalg.norm(array.positions_m[:, None] - array.positions_m, axis=2)
-    for k, frequency in enumerate(f):
-        field = np.sinc(2 * frequency * distance / 343.0) + np.diag(np.where(usable, 0.2, 1e3))
-        for p in range(8):
-            others = np.arange(8) != p
-            guess = np.linalg.solve(field[np.ix_(others, others)], field[others, p])
-            np.testing.assert_allclose(weights[k, p, others], guess, atol=1e-5)
-            assert weights[k, p, p] == 0.0
-
-
-def test_place_scores_are_their_definition() -> None:
-    rng = np.random.default_rng(0)
-    frames = rng.standard_normal((40, 3, 5)) + 1j * rng.standard_normal((40, 3, 5))
-    z = frames / np.abs(frames)
-    weights = np.abs(rng.standard_normal((3, 5, 5))) * (1 - np.eye(5))
-    expected = np.empty((5, 5))
-    for m in range(5):
-        for p in range(5):
-            others = [j for j in range(5) if j not in (m, p)]
-            without = np.einsum("tkj,kj->tk", z[:, :, others], weights[:, p, others])
-            guess = np.einsum("tkj,kj->tk", z, weights[:, p])
-            power = np.square(np.abs(guess)).mean(axis=0).sum()
-            agreement = (z[:, :, m] * without.conj()).real.mean(axis=0).sum()
-            expected[m, p] = agreement / np.sqrt(3 * power)
-    coherence = np.einsum("tki,tkj->kij", z, z.conj()).real / 40
-    scores = position_scores(coherence.astype(np.float32), weights.astype(np.float32))
-    np.testing.assert_allclose(scores, expected, atol=1e-5)
-
-
-def test_masks_scale_back_to_the_whole() -> None:
-    mask = ChannelMask(np.array([True, False, True, True, False]))
-    assert mask.power_scale == pytest.approx(25 / 9)
-    assert mask.pair_scale == pytest.approx(10 / 3)
-    nobody = ChannelMask(np.zeros(3, bool))
-    assert np.isfinite([nobody.power_scale, nobody.pair_scale]).all()
-
-
-def test_losses_of_the_transport_are_no_fault_of_a_microphone():
+def test_lost_packets_are_no_microphone_faults():
     rng = np.random.default_rng(5)
     sound = rng.standard_normal((40_000, 1)) + 0.3 * rng.standard_normal((40_000, 3))
     for first in (9_900, 13_300, 17_750):

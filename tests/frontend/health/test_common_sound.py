@@ -1,4 +1,4 @@
-"""Independent noise, and sound that contradicts the positions, is not heard from the first second on."""
+"""Independent noise and sound that contradicts the positions are unusable from the first second on."""
 
 import json
 import os
@@ -33,7 +33,7 @@ from worldstate.simulation.stream.writing import draw_stream
 
 RATE = 16_000
 REAL = Path(os.environ.get("FOUR_MICROPHONES", Path(__file__).parents[4] / "shared" / "four-microphones"))
-# Not documented: an upright turned square, 6.5 cm from corner to corner, is near what fits its sound.
+# The positions are not documented; an upright square of 6.5 cm diagonal nearly fits its sound.
 BOARD = [[0.0, 0.0137, -0.0293], [0.0, -0.0293, -0.0137], [0.0, -0.0137, 0.0293], [0.0, 0.0293, 0.0137]]
 ROOF = roof_array_56().positions_m
 ARRAYS = {
@@ -73,7 +73,7 @@ def frames_of(array: MicrophoneArray, sound: np.ndarray) -> list[AcousticFrame]:
 
 @pytest.mark.parametrize("spectrum", SPECTRA)
 @pytest.mark.parametrize("name", ARRAYS)
-def test_of_independent_noise_nothing_is_heard(name: str, spectrum: str) -> None:
+def test_independent_noise_is_unusable(name: str, spectrum: str) -> None:
     array = MicrophoneArray(ARRAYS[name])
     for noise_db in (10.0, 20.0, 30.0):
         frames = frames_of(array, street(array, spectrum, noise_db))
@@ -82,19 +82,19 @@ def test_of_independent_noise_nothing_is_heard(name: str, spectrum: str) -> None
     assert all(frame.heard == 1.0 for frame in frames_of(array, street(array, spectrum, -6.0)))
 
 
-def test_where_a_diffuse_field_leaves_no_coherence_it_decides_nothing() -> None:
+def test_a_wide_pair_makes_no_decision_about_common_sound() -> None:
     pair = MicrophoneArray([[0.0, 0.34, 0.0], [0.0, -0.34, 0.0]])
     assert all(frame.unheard is None for frame in frames_of(pair, street(pair, "white", 30.0)))
 
 
-def test_samples_of_another_format_are_not_heard() -> None:
-    """Bits that are no samples have all values alike."""
+def test_samples_of_another_format_are_unusable() -> None:
+    """Bytes of another format are uniformly distributed."""
     array = MicrophoneArray(ROOF[:4])
     dealt = np.random.default_rng(0).integers(-(2**15), 2**15, (2 * RATE, 4), np.int16)
     assert max(frame.heard or 0.0 for frame in frames_of(array, dealt)) == 0.0
 
 
-def test_the_sensor_is_impaired_and_the_recording_not_healthy() -> None:
+def test_noise_makes_the_sensor_impaired_and_the_recording_unhealthy() -> None:
     array, log = roof_array_56(), HealthLog()
     noise = np.random.default_rng(0).standard_normal((2 * RATE, 56)).astype(np.float32)
     adapter = AcousticAdapter(array, RATE, Unasked(), front_end_settings=FrontEndSettings.heard_at(RATE))
@@ -105,7 +105,7 @@ def test_the_sensor_is_impaired_and_the_recording_not_healthy() -> None:
 
 
 class Unasked:
-    """A model that may not learn from what was not heard."""
+    """A model that must not be called for unusable sound."""
 
     def evidence(self, feature: np.ndarray) -> object:
         raise AssertionError("asked of noise")
@@ -113,7 +113,7 @@ class Unasked:
 
 @settings(max_examples=30)
 @given(st.integers(0, 40), st.floats(-3.0, 6.0), st.sampled_from([NOTHING_IN_COMMON, OUT_OF_PLACE]))
-def test_what_is_usual_is_not_learned_from_what_was_not_heard(hops: int, nats: float, reason: str) -> None:
+def test_the_usual_level_is_not_learned_from_unusable_sound(hops: int, nats: float, reason: str) -> None:
     one, other, quiet = NoiseMeter(), NoiseMeter(), np.full(BANDS, -12.0)
     for _ in range(hops):
         assert one.push(quiet + nats, 0.0, (0.0, reason)) == (0.0, reason)
@@ -139,7 +139,7 @@ def far_field(positions_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(6, 9), st.floats(0.1, 0.6))
 def test_waves_fit_the_positions_and_no_other_order(seed: int, n: int, extent_m: float) -> None:
-    """Of irregular arrays nearly every other order is another array."""
+    """For an irregular array nearly every other order is another array."""
     rng = np.random.default_rng(seed)
     positions = extent_m * rng.uniform(-0.5, 0.5, (n, 3))
     check, coherence = FarField(positions, BINS_HZ), np.asarray(far_field(positions, rng), np.complex64)
@@ -147,7 +147,7 @@ def test_waves_fit_the_positions_and_no_other_order(seed: int, n: int, extent_m:
     orders = [rng.permutation(n) for _ in range(20)]
     others = [check.misfit(coherence[:, one][:, :, one], 0.005) for one in orders]
     known = [one for one in others if one is not None]
-    # Waves that are long for the array show little of its order.
+    # Waves much longer than the array show little of its order.
     assert len(known) > 10 or extent_m < 0.2
     assert fits is None or fits < 0.1
     assert len(known) < 10 or np.median(known) > 0.5
@@ -156,7 +156,7 @@ def test_waves_fit_the_positions_and_no_other_order(seed: int, n: int, extent_m:
 @pytest.mark.filterwarnings("error")
 @settings(max_examples=10, deadline=None)
 @given(st.integers(1, 9000), st.integers(3, 6))
-def test_what_was_heard_before_a_loss_of_any_length_is_forgotten_and_no_more(lost: int, n: int) -> None:
+def test_common_sound_recovers_after_a_loss_of_any_length(lost: int, n: int) -> None:
     rng = np.random.default_rng(lost)
     positions = rng.uniform(-0.2, 0.2, (n, 3))
     common, keep = CommonSound(MicrophoneArray(positions), BINS_HZ), np.ones(n, bool)
@@ -168,7 +168,7 @@ def test_what_was_heard_before_a_loss_of_any_length_is_forgotten_and_no_more(los
     assert (share, reason) == (1.0, None)
 
 
-def test_the_mean_over_all_orders_is_that_over_each_of_them() -> None:
+def test_the_mean_misfit_over_all_orders_is_one() -> None:
     rng = np.random.default_rng(0)
     positions = rng.uniform(-0.2, 0.2, (5, 3))
     field = FarField(positions, BINS_HZ)
@@ -204,7 +204,7 @@ def _bits(sound: np.ndarray, kind: str) -> np.ndarray:
 
 @pytest.fixture(scope="module", params=["SA1", "TB2"])
 def streets(request: pytest.FixtureRequest) -> dict[str, np.ndarray]:
-    """Some seconds of busy streets, one a renderer, at each array."""
+    """Return some seconds of busy streets of each renderer at each array."""
     chosen = StreamSettings(site(request.param), 0.11, 5, traffic_named("pairs"), sample_rate_hz=6000.0)
     shifted = [
         places - places.mean(axis=0) + [0.013 * i, 0.0, 0.0] for i, places in enumerate(SPREAD.values())
@@ -217,9 +217,7 @@ def streets(request: pytest.FixtureRequest) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", CROSSED)
-def test_channels_that_are_not_where_they_are_said_to_be_are_not_heard(
-    kind: str, streets: dict[str, np.ndarray]
-) -> None:
+def test_sound_of_wrong_channels_is_unusable(kind: str, streets: dict[str, np.ndarray]) -> None:
     rng = np.random.default_rng(1)
     for name, sound in streets.items():
         array, wrong = MicrophoneArray(SPREAD[name]), CROSSED[kind](np.ascontiguousarray(sound), rng)
@@ -230,15 +228,15 @@ def test_channels_that_are_not_where_they_are_said_to_be_are_not_heard(
         assert np.mean(unheard) > 0.9, name
 
 
-def test_a_turn_of_a_ring_is_another_azimuth_of_the_sound_and_is_heard() -> None:
-    """No sound shows it: the page names `array check --heard-from` for that."""
+def test_a_rotated_ring_is_still_usable() -> None:
+    """Sound alone cannot show a rotation; `array check --heard-from` does."""
     array = MicrophoneArray(ARRAYS["respeaker-6"])
     turned = street(array, "white", -6.0)[:, [1, 2, 3, 4, 5, 0]]
     assert all(frame.heard == 1.0 for frame in frames_of(array, turned))
 
 
 @pytest.mark.parametrize("kind", ["random order", "each later, up to 1 s", "every other inverted"])
-def test_array_check_ends_with_1_and_names_why(
+def test_array_check_exits_with_1_and_the_reason(
     kind: str, streets: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     array, sound = MicrophoneArray(SPREAD["uma-8"]), np.ascontiguousarray(streets["uma-8"])
@@ -253,8 +251,8 @@ def test_array_check_ends_with_1_and_names_why(
 
 @pytest.mark.long
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"no recordings in {REAL}")
-def test_real_streets_are_heard() -> None:
-    """At most one hop in a hundred of real streets, four microphones, has nothing in common."""
+def test_real_streets_are_usable() -> None:
+    """At most 1 % of hops of real streets with four microphones have no common sound."""
     from worldstate.adapters.audio.sound_file import open_sound
 
     array, unheard = MicrophoneArray(BOARD), []

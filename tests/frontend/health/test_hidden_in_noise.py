@@ -1,4 +1,4 @@
-"""A vehicle hidden in independent noise: not heard, with the belief carried, or announced as without it."""
+"""A vehicle in independent noise: the sound is unusable, or the vehicle is announced as without noise."""
 
 from dataclasses import replace
 
@@ -45,9 +45,9 @@ def announced(some: list[Step]) -> bool:
 
 
 def verdict(seed: int) -> tuple[str, str]:
-    """Return the spectrum of one draw, and how it ends: unheard, as without the noise, or why it fails.
+    """Return the spectrum of one draw and its result: unheard, as without the noise, or a failure.
 
-    Unheard means that the risk is not below the belief of the first hop, which no sound has reached.
+    Unheard also requires that the risk does not fall below that of the first hop.
     """
     rng = np.random.default_rng(seed)
     array, spectrum = drawn_array(rng), str(rng.choice(list(SPECTRA)))
@@ -74,16 +74,16 @@ def verdict(seed: int) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("seed", [5002, 5004])
-def test_a_vehicle_in_noise_is_not_heard_or_announced(seed: int) -> None:
+def test_a_vehicle_in_noise_is_unheard_or_announced(seed: int) -> None:
     assert verdict(seed)[1] in (UNHEARD, AS_WITHOUT)
 
 
 @pytest.mark.slow
-def test_of_a_hundred_draws_at_most_eleven_fail() -> None:
-    """None is asked to fail; when this was written five did, and eleven are the upper end of their interval.
+def test_at_most_eleven_of_a_hundred_draws_fail() -> None:
+    """Five of 100 draws failed when this was measured; eleven is the upper end of the interval.
 
-    Four of the five were wind that covers the long waves only, and is heard beside them: it leaves as much in
-    common as a windy street without any fault has. The fifth was heard for one hop.
+    In four of them wind covers only the low frequencies, as in a windy street without any fault. In the
+    fifth the sound was usable for one hop.
     """
     first = int(np.random.SeedSequence().generate_state(1)[0])
     found = [verdict(first + i) for i in range(100)]

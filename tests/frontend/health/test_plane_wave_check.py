@@ -30,7 +30,7 @@ from worldstate.simulation.stream.writing import write_stream
 RATE = 6000
 ARRAYS = {56 // step: MicrophoneArray(ovad_array().positions_m[::step]) for step in (2, 7)}
 CARD = {28: slice(8, 16), 8: slice(4, 8)}
-# A second clock shows in ten seconds among many channels, in fifteen to thirty among 8.
+# A second clock is found after 10 s among many channels and after 15 to 30 s among eight.
 SECONDS = {28: 11.0, 8: 20.0}
 
 STREAMS = (("SA1", "calm"), ("SA2", "busy"), ("SB1", "empty"), ("SB3", "no-hazard"))
@@ -96,7 +96,7 @@ def exchange(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[i
 
 
 def heard(array: MicrophoneArray, sound: np.ndarray) -> tuple[dict[str, set[int]], list[ChannelFault]]:
-    """What `doctor` says in the end, and what the monitor says in the last hop."""
+    """Return the faults of the whole recording and those of the last hop."""
     log, kinds = HealthLog(), {}
     frames = FrontEnd(array, RATE).process(sound)
     for frame in frames:
@@ -117,7 +117,7 @@ def test_a_healthy_array_is_silent(n_channels: int) -> None:
     ("spoil", "n_channels"),
     [(exchange, 28), *((spoil, n) for spoil in (gain, gusts, offset, drift) for n in ARRAYS)],
 )
-def test_each_fault_is_named_and_nothing_else(spoil: Spoil, n_channels: int) -> None:
+def test_each_timing_fault_is_found_alone(spoil: Spoil, n_channels: int) -> None:
     sound = street(n_channels).copy()
     expected = spoil(sound, n_channels, np.random.default_rng(3))
     kinds, latest = heard(ARRAYS[n_channels], sound)
@@ -133,7 +133,7 @@ def test_each_fault_is_named_and_nothing_else(spoil: Spoil, n_channels: int) -> 
 
 
 def order_of(sound: np.ndarray) -> tuple[int, ...] | None:
-    """The order of eight channels that fits better than the one claimed."""
+    """Return the order of eight channels that fits better than the claimed one."""
     check = PositionCheck(ARRAYS[8], RATE)
     for start in range(0, len(sound), RATE):
         check.push(sound[start : start + RATE].astype(np.float32))
@@ -147,7 +147,7 @@ def test_an_exchange_of_eight_is_found_by_the_positions_alone(a: int, b: int) ->
     assert order_of(sound) == tuple(expected)
 
 
-def test_doctor_says_which_card_is_late_by_how_much(
+def test_array_check_prints_the_delay_of_a_late_card(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sound = street(8)[: 12 * RATE].copy()
@@ -198,7 +198,7 @@ def test_a_card_is_found_under_any_tilt(seed: int, amount: float) -> None:
 
 @pytest.mark.slow
 def test_twenty_recordings_of_eight_microphones(tmp_path: Path) -> None:
-    """Four simulated streams of 150 s: silent in order, and each fault found in 18 of 20 pieces of 30 s."""
+    """Four simulated streams of 150 s: no false fault, and each fault found in 18 of 20 pieces of 30 s."""
     found: Counter[str] = Counter()
     n_false, rng = 0, np.random.default_rng(31)
     for seed, (place, traffic) in enumerate(STREAMS, start=81):

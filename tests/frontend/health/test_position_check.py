@@ -60,7 +60,7 @@ def talkers() -> np.ndarray:
 def test_right_positions_fit(talkers: np.ndarray) -> None:
     found = verdict(talkers, ring(6, 0.045))
     assert found.fits
-    # What no sound shows is said.
+    # Properties that sound cannot show are listed.
     assert any("mirrored or turned" in one for one in found.unjudged)
 
 
@@ -76,31 +76,31 @@ def test_two_exchanged_are_named(talkers: np.ndarray) -> None:
     )
 
 
-def test_a_random_order_fits_nowhere(talkers: np.ndarray) -> None:
+def test_a_random_order_does_not_fit(talkers: np.ndarray) -> None:
     assert verdict(talkers, ring(6, 0.045)[[3, 0, 4, 1, 5, 2]]).order is not None
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.3, 39.37])
-def test_another_size(talkers: np.ndarray, factor: float) -> None:
+def test_a_wrong_size_is_estimated(talkers: np.ndarray, factor: float) -> None:
     size = verdict(talkers, factor * ring(6, 0.045)).size
     assert size is not None
     assert size * factor == pytest.approx(1.0, abs=0.12)
 
 
-def test_mountings_show_in_a_sound_from_a_known_side() -> None:
+def test_a_sound_from_a_known_side_shows_the_mounting() -> None:
     sound, there = room(ring(6, 0.045), (40.0,), seed=1), ring(6, 0.045)
     sound = np.concatenate([sound, room(there, (40.0,), seed=2)])
     assert verdict(sound, there, 40.0).fits
     assert verdict(sound, there * [1.0, -1.0, 1.0], 40.0).mounting == ("mirrored",)
     assert "turned by 120 degrees" in verdict(sound, np.roll(there, 2, axis=0), 40.0).mounting
-    # Without its side nothing is concluded.
+    # Without a known side there is no conclusion.
     assert verdict(sound, there * [1.0, -1.0, 1.0]).fits
 
 
 @pytest.mark.parametrize(
     "sound", [np.zeros((RATE * 4, 6)), np.random.default_rng(0).standard_normal((RATE * 4, 6))]
 )
-def test_nothing_is_concluded_of_silence_and_own_noise(sound: np.ndarray) -> None:
+def test_silence_and_independent_noise_allow_no_conclusion(sound: np.ndarray) -> None:
     found = verdict(sound.astype(np.float32), ring(6, 0.045))
     assert found.fits
     assert "coherent sound" in found.unjudged[0]
@@ -151,7 +151,7 @@ def fitted(sounds: list[np.ndarray], claimed: np.ndarray) -> FittedPositions:
 
 
 def error_m(found: np.ndarray, there: np.ndarray) -> float:
-    """Largest distance of a microphone from where it stands, up to a turn or a mirror image."""
+    """Return the largest position error, up to a rotation or a reflection."""
     a, b = ((one - one.mean(axis=0))[:, :2] for one in (found, there))
     u, _, v = np.linalg.svd(a.T @ b)
     return float(np.linalg.norm(a @ (u @ v) - b, axis=1).max())
@@ -203,7 +203,7 @@ def test_three_plane_waves_give_the_positions_whatever_those_given_are(seed: int
 
 @pytest.mark.parametrize("claimed", [0.02, None], ids=["centimetres off", "in another order"])
 def test_talkers_in_a_live_room_give_the_positions(claimed: float | None) -> None:
-    """A descent from positions two centimetres off alone ends 86 mm off."""
+    """A plain descent from positions that are 20 mm off ends 86 mm off."""
     sound = room(HEXAGON, tuple(range(0, 360, 60)), seed=1)
     noise = np.random.default_rng(3).standard_normal((6, 3)) * [1.0, 1.0, 0.0]
     given = HEXAGON[[3, 0, 4, 1, 5, 2]] if claimed is None else HEXAGON + claimed * noise
@@ -216,7 +216,7 @@ def test_talkers_in_a_live_room_give_the_positions(claimed: float | None) -> Non
     [
         (waves(HEXAGON, (40.0,)), "several sides, got sound from"),
         (waves(HEXAGON, (40.0, 55.0)), "several sides, got sound from"),
-        # Cards that began up to a hundredth of a second apart.
+        # Cards that started up to 10 ms apart.
         (
             np.column_stack(
                 [np.roll(one, 32 * k) for k, one in enumerate(waves(HEXAGON, (0.0, 100.0, 220.0)).T)]
@@ -233,13 +233,13 @@ def test_sound_that_shows_no_positions_is_refused(sound: np.ndarray, problem: st
 
 
 def test_fitting_true_positions_returns_them(around: list[np.ndarray]) -> None:
-    """Law, as everything is better by chance on the sound that it was fitted to: it is judged on another."""
+    """Any fit is better by chance on its own sound, so it is evaluated on other sound."""
     found = fitted(around, SQUARE)
     np.testing.assert_array_equal(found.positions_m, SQUARE)
     assert found.explained == found.explained_before
 
 
-def test_an_unusable_channel_stays() -> None:
+def test_an_unusable_channel_keeps_its_position() -> None:
     sound = np.column_stack([room(ring(5, 0.032), (-30.0, 0.0, 30.0), seed=3), np.zeros(3 * 2 * RATE)])
     claimed = np.vstack([1.4 * ring(5, 0.032), [0.1, 0.2, 0.0]])
     found = fit_positions([taken(sound.astype(np.float32), claimed)], np.arange(6) < 5)
