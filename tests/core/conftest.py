@@ -1,7 +1,6 @@
-"""Hold one published quantity at the first value it had, where an environment variable names it.
+"""Freeze one published quantity at its first value if an environment variable is set.
 
-One that may be held so without any test noticing is read by users and guarded by nobody:
-`run_mutations.py --freeze` tries them all.
+If no test fails, the quantity is untested; `run_mutations.py --freeze` tries all of them.
 """
 
 import os
@@ -17,7 +16,7 @@ from worldstate import WorldFilter
 def frozen_quantity():
     name, state, first = os.environ.get("WORLDSTATE_FREEZE"), WorldFilter.__dict__["state"], {}
     if name is not None:
-        # Under another name the property would be computed at every reading.
+        # Without its name the property would not be cached.
         wrapped = cached_property(lambda world: held(state.func(world), name, first))
         wrapped.__set_name__(WorldFilter, "state")
         WorldFilter.state = wrapped

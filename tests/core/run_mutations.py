@@ -1,9 +1,8 @@
-"""Apply every mutation of `mutations.json` to a copy of the library, and tell which test notices it.
+"""Apply every mutation of `mutations.json` to a copy of the library and print the test that fails.
 
-A mutation is an error of sign, factor or order that somebody could make: its area, a file, a piece of text
-that stands there once, what replaces it, and the test likeliest to notice it. That one runs first, the suite
-of the core where it passes, each in a process of its own, forked after the packages from elsewhere were
-imported, which takes longer than most tests.
+A mutation is a plausible error of sign, factor or order: its area, file, old text (which occurs once), new
+text and the test most likely to fail. That test runs first; if it passes, all tests of the core run. Each run
+is a forked process, because importing the external packages takes longer than most tests.
 """
 
 import argparse
@@ -53,7 +52,7 @@ AREAS = ("belief", "association", "alarm", "hearing")
 
 
 def copied(root: Path) -> None:
-    """Copy what the tests need, links as links."""
+    """Copy the tracked top-level files and folders, links as links."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in {line.split("/")[0] for line in listed.splitlines()}:
         if (ROOT / name).is_dir():
@@ -63,7 +62,7 @@ def copied(root: Path) -> None:
 
 
 def noticed_by(root: Path, tests: tuple[str, ...], limit_s: float, freeze: str | None = None) -> str | None:
-    """Return the first test that fails, or that the time is up; None where all pass."""
+    """Return the first failing test or a timeout; None if all pass."""
     out = root / "out.txt"
     child = os.fork()
     if child == 0:
@@ -93,14 +92,14 @@ def noticed_by(root: Path, tests: tuple[str, ...], limit_s: float, freeze: str |
 
 
 def mutated(root: Path, one: Mutation, stages: Stages, limit_s: float) -> str | None:
-    """Return what notices a mutation; None of a survivor."""
+    """Return the test that detects a mutation, or None."""
     path = root / one.file
     stat, text = path.stat(), path.read_text()
     assert text.count(one.old) == 1, one.name
     path.write_text(text.replace(one.old, one.new))
     noticed = first_of(root, stages, limit_s)
     path.write_text(text)
-    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # What was compiled of it is valid again
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # The compiled file is valid again
     return noticed
 
 
@@ -109,7 +108,7 @@ def first_of(root: Path, stages: Stages, limit_s: float, freeze: str | None = No
 
 
 def results(root: Path, told: argparse.Namespace) -> Iterator[tuple[str, str, str | None]]:
-    """Yield area, name and what noticed it of every mutation, or of every quantity that is held."""
+    """Yield area, name and failing test of every mutation, or of every frozen quantity."""
     rest = [] if told.quick else [("tests/core",)]
     if told.freeze:
         sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
@@ -123,14 +122,18 @@ def results(root: Path, told: argparse.Namespace) -> Iterator[tuple[str, str, st
 
 
 def main() -> bool:
-    """Run the campaign and print one line a mutant; return whether so many were noticed as are expected."""
+    """Run the campaign, print one line per mutation, and return whether enough were detected."""
     parser = argparse.ArgumentParser(description=__doc__, epilog=EXAMPLE)
-    parser.add_argument("--area", choices=AREAS, help="of the mutations; all where not given")
-    parser.add_argument("--match", default="", metavar="TEXT", help="only those with it in their name")
-    parser.add_argument("--only", type=int, metavar="N", help="the first so many")
-    parser.add_argument("--freeze", action="store_true", help="hold published quantities instead")
-    parser.add_argument("--quick", action="store_true", help="only the tests named with each")
-    parser.add_argument("--limit", type=float, default=600.0, metavar="S", help="seconds a run (%(default)s)")
+    parser.add_argument("--area", choices=AREAS, help="area of the mutations; default: all")
+    parser.add_argument(
+        "--match", default="", metavar="TEXT", help="only mutations with this text in their name"
+    )
+    parser.add_argument("--only", type=int, metavar="N", help="only the first N")
+    parser.add_argument("--freeze", action="store_true", help="freeze published quantities instead")
+    parser.add_argument("--quick", action="store_true", help="run only the listed test of each")
+    parser.add_argument(
+        "--limit", type=float, default=600.0, metavar="S", help="seconds per run (%(default)s)"
+    )
     told = parser.parse_args()
     for name in _ELSEWHERE:
         import_module(name)
@@ -138,7 +141,7 @@ def main() -> bool:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         copied(root)
-        noticed_by(root, ("--collect-only", "tests/core"), told.limit)  # Compiles all that is not mutated
+        noticed_by(root, ("--collect-only", "tests/core"), told.limit)  # Compile all files first
         sys.dont_write_bytecode = True
         last_s = time.monotonic()
         for area, name, by in results(root, told):

@@ -29,7 +29,7 @@ def scan(number, places):
 
 
 def stone_soup_chances(before, places):
-    """Return P(a position is its) of every entity, as Stone Soup's JPDA has it."""
+    """Return P(a position belongs to the entity) of every entity by Stone Soup's JPDA."""
     from stonesoup.dataassociator.probability import JPDA
     from stonesoup.hypothesiser.probability import PDAHypothesiser
     from stonesoup.models.measurement.linear import LinearGaussian
@@ -54,7 +54,7 @@ def stone_soup_chances(before, places):
             return super().hypothesise(track, *rest, **options)
 
     model = LinearGaussian(4, (0, 1, 2, 3), np.eye(4) * STD**2)
-    # A scan tells velocities, too: those of anybody have 15 m/s beside the noise.
+    # A scan includes velocities; those of new vehicles have a spread of 15 m/s beside the noise.
     anybody = 1.0 / (2.0 * math.pi * (STD**2 + 15.0**2))
     density = (BIRTHS - math.log1p(-CLUTTER)) / (RADAR.sector.half_width_rad * RANGE_M**2) * anybody
     still = CombinedLinearGaussianTransitionModel([RandomWalk(0.0)] * 4)
@@ -76,7 +76,7 @@ def stone_soup_chances(before, places):
 def test_existence_is_summed_over_the_joint_events_of_stone_soups_jpda(seed):
     pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
     rng = np.random.default_rng(seed)
-    # So near one another that every position may be anybody's, and as many of them as there may be.
+    # The vehicles are so close that every position may belong to each of them.
     places = np.array([20.0, 0.0]) + rng.normal(0.0, 1.0, (3, 2))
     again = places[: rng.integers(1, 4)] + rng.normal(0.0, 0.5, (1, 2))
     world = WorldFilter().update(scan(1, places.tolist()))
@@ -127,11 +127,11 @@ def test_belief_propagation_is_near_the_sum_over_all_events(log_ratios):
     assert (near.sum(axis=0) <= 1.0 + 1e-9).all() and (near.sum(axis=1) <= 1.0 + 2e-3).all()
 
 
-def test_of_a_crowd_states_follow_the_likeliest_and_existence_all_events():
+def test_a_crowd_uses_the_likeliest_event_for_states_and_all_events_for_existence():
     crowd = np.full((8, 8), -2.0) + 6.0 * np.eye(8)
     found = joint_association(crowd, np.ones(8, bool))
     assert found.found == {i: i for i in range(8)}
-    # One of two that stand abreast has e^4 against 1 and seven of e^-2, which others have by e^4.
+    # The diagonal has e^4 against 1 and seven pairs of e^-2.
     assert found.chances == pytest.approx([0.98] * 8, abs=0.01)
 
 
@@ -144,8 +144,8 @@ def looked(time_s, nats, *sightings, kinds=()):
 @pytest.mark.parametrize(
     ("label", "same"), [("car", True), ("bus", True), ("bicycle", False), ("person", False)]
 )
-def test_whoever_comes_into_view_has_to_be_what_was_heard(label, same):
-    """At the edge of the side that may have been misheard; a van is a car to some, a truck to others."""
+def test_a_hand_over_needs_a_matching_class(label, same):
+    """At the edge of the other side; detectors label a van as a car or as a truck."""
     world = WorldFilter()
     for hop in range(1, 30):
         world = world.update(looked(hop / 10, (3.0, 0.0), kinds=(("truck", 0.4), ("van", 0.6))))
@@ -156,8 +156,8 @@ def test_whoever_comes_into_view_has_to_be_what_was_heard(label, same):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("azimuth_rad", "width_rad", "same"), [(0.44, 0.08, True), (0.25, 0.27, False)])
-def test_a_vehicle_that_comes_past_an_edge_shows_its_front_first(sign, azimuth_rad, width_rad, same):
-    """One that pulls out from the kerb or turns in ahead shows all of itself: another one is still heard."""
+def test_a_hand_over_needs_a_box_at_the_edge(sign, azimuth_rad, width_rad, same):
+    """A vehicle that leaves a parking space is wholly visible, so the hidden one is another vehicle."""
     world = WorldFilter()
     for hop in range(1, 30):
         world = world.update(looked(hop / 10, (3.0, 0.0) if sign > 0.0 else (0.0, 3.0)))
@@ -170,8 +170,8 @@ def test_a_vehicle_that_comes_past_an_edge_shows_its_front_first(sign, azimuth_r
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("azimuth_rad", "width_rad", "leaves"), [(0.34, 0.4, True), (0.53, 0.05, False)])
-def test_one_that_leaves_where_another_comes_does_not_take_it_over(sign, azimuth_rad, width_rad, leaves):
-    """Its leading end has passed the edge: a box there is of the one heard behind it, one before its own."""
+def test_a_leaving_vehicle_does_not_take_the_identity_of_a_coming_one(sign, azimuth_rad, width_rad, leaves):
+    """A leaving vehicle has passed the edge; a box at the edge belongs to the hidden vehicle behind it."""
     world, nats = WorldFilter(), (3.0, 0.0) if sign > 0.0 else (0.0, 3.0)
     for hop in range(1, 30):
         world = world.update(looked(hop / 10, nats))
@@ -186,8 +186,8 @@ def test_one_that_leaves_where_another_comes_does_not_take_it_over(sign, azimuth
     assert (seen.id != heard.id) == leaves
 
 
-def test_of_two_who_may_have_been_found_the_other_one_keeps_his_existence():
-    """Two cars a degree apart and one box between them: an empty look would take both down by .04."""
+def test_an_ambiguous_box_lowers_the_existence_of_neither_vehicle():
+    """Two cars are a degree apart with one box between them; a missed look would lower both."""
     world = WorldFilter()
     for hop in range(1, 8):
         both = [Sighting(azimuth, 0.03, "car", 0.9) for azimuth in (0.0, 0.02)]

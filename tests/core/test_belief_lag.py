@@ -1,4 +1,4 @@
-"""Windows of one source that overlap are one piece of evidence; those of two sources are two."""
+"""Overlapping windows of one source count as one piece of evidence, those of two sources as two."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from worldstate.state import Context, Priors
 
 PRIORS = Priors(0.3, 0.3, 0.4)
 NOTHING, UNASKED = NotUsable("-"), Unqueried("-")
-# So short that the vehicles of the street do not move meanwhile: what evidence makes of the prior is left.
+# The steps are so short that the dynamics change nothing and only the evidence acts.
 MEMORY_NS = 10_000
 SETTINGS = FilterSettings(window_s=MEMORY_NS / 1e9, street=StreetModel(window_s=MEMORY_NS / 1e9))
 nats = st.floats(-4.0, 4.0)
@@ -44,9 +44,9 @@ def believed(measurements, settings=SETTINGS):
 
 
 def by_hand(weighted):
-    """Eq. (6) with likelihoods raised to weights; two hidden vehicles sound as each does, half of it.
+    """Eq. (6) with likelihoods raised to weights; two hidden vehicles have the mean of both likelihoods.
 
-    A window that denies a vehicle in view denies it beside a hidden one as well.
+    Evidence against a visible vehicle also counts against one beside a hidden vehicle.
     """
     chance, seen = 1.0 - np.sqrt(1.0 - PRIORS.hidden), PRIORS.visible / (1.0 - PRIORS.hidden)
     one = chance * (1.0 - chance)
@@ -64,10 +64,10 @@ def by_hand(weighted):
 
 
 @given(windows)
-def test_of_a_window_so_much_counts_as_is_new_since_the_last_one(told):
+def test_only_the_new_part_of_a_window_counts(told):
     """Log-likelihoods are averaged over the memory.
 
-    What is alike for all explanations, or could not be heard, is no window.
+    A window without information or of unusable sound does not count.
     """
     stamp_ns, since_ns, measurements, weighted = 10**9, None, [], []
     for signature, step_ns, usable in told:
@@ -81,7 +81,7 @@ def test_of_a_window_so_much_counts_as_is_new_since_the_last_one(told):
 
 
 @given(signatures, st.integers(1, 10))
-def test_a_window_counts_once_however_often_it_is_repeated(signature, hops):
+def test_repeated_windows_count_once(signature, hops):
     got = believed([heard(10**9 + hop * MEMORY_NS // 10, signature) for hop in range(hops)])
     assert got == pytest.approx(by_hand([(signature, 1.0)]), abs=1e-4)
     again = believed([heard(10**9, signature)] * hops)
@@ -89,7 +89,7 @@ def test_a_window_counts_once_however_often_it_is_repeated(signature, hops):
 
 
 @given(signatures, signatures, st.integers(1, 10))
-def test_another_modality_is_news(sound, radar, hops):
+def test_windows_of_another_modality_count_in_full(sound, radar, hops):
     told = [
         heard(10**9 + hop * MEMORY_NS // 20, *one)
         for hop in range(hops)
@@ -99,7 +99,7 @@ def test_another_modality_is_news(sound, radar, hops):
 
 
 @given(signatures, st.integers(1, 20), st.integers(1, 3 * MEMORY_NS))
-def test_multiplied_as_likelihoods_windows_end_to_end_count_each(signature, hops, step_ns):
+def test_consecutive_windows_count_each_if_multiplied_as_likelihoods(signature, hops, step_ns):
     times, settings = (
         1.0 + (hops - 1) * min(step_ns / MEMORY_NS, 1.0),
         replace(SETTINGS, windows="likelihood"),

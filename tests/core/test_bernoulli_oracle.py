@@ -1,4 +1,4 @@
-"""Existence of a target that is found half the time, and goes or is half hidden: Stone Soup's and ours."""
+"""Existence of a target that leaves or is half hidden, compared with Stone Soup."""
 
 import runpy
 from datetime import datetime, timedelta
@@ -21,7 +21,7 @@ EPOCH = datetime(2000, 1, 1)
 
 
 def scripted(rng):
-    """Return the place at which the radar finds the target at every step, None where it does not."""
+    """Return the position of the target at every step, None if the radar misses it."""
     place = np.array([20.0, 3.0]) + np.outer(STEP_S * np.arange(STEPS), SPEED_MPS)
     found = (rng.random(STEPS) < FOUND) & (np.arange(STEPS) < GONE)
     found[0] = True
@@ -32,7 +32,7 @@ def scripted(rng):
 def ours(places):
     """Return the existence that the filter publishes after every scan."""
     radar = SearchedSector(Sector(0.0, 1.2), range_m=1e3, detection_probability=FOUND, clutter_rate=CLUTTER)
-    # Gone means gone: below the usual .05 an entity would be dropped while Stone Soup's still counts down.
+    # At the usual threshold of 0.05 the entity would be dropped while Stone Soup's still decays.
     world, exists = WorldFilter(settings=FilterSettings(street=StreetModel(death=1e-3))), []
     noise = tuple(map(tuple, np.diag([STD_M**2] * 4).tolist()))
     for step, place in enumerate(places):
@@ -43,7 +43,7 @@ def ours(places):
 
 
 def corrected(updater):
-    """Return a Bernoulli updater that counts empty scans, at which the stock one leaves all as it was."""
+    """Return a Bernoulli updater with empty scans, which the stock one ignores."""
 
     class Counting(updater):
         def update(self, hypotheses, **given):
@@ -73,7 +73,7 @@ def stone_soup(places, start, corrects):
     from stonesoup.updater.particle import BernoulliParticleUpdater
 
     class Births:
-        """A handful of particles where the target is not: nobody is born."""
+        """A few particles far from the target, so that there are no births."""
 
         def sample(self, detections, **_):
             far = StateVectors(np.tile([[500.0], [0.0], [500.0], [0.0]], 5))
@@ -112,11 +112,11 @@ def stone_soup(places, start, corrects):
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_a_target_that_goes_is_forgotten_as_stone_soups_particles_forget_it(seed):
+def test_existence_after_a_target_leaves_equals_stone_soups(seed):
     pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
     places = scripted(np.random.default_rng(seed))
     mine = ours(places)
-    # From its last detection on: how near detections are enters in the tests of the association.
+    # Compare from the last detection on; other tests cover the association.
     last = max(step for step, place in enumerate(places) if place is not None)
     theirs, stock = (stone_soup(places[last:], mine[last], corrects) for corrects in (True, False))
     np.testing.assert_allclose(mine[last:], theirs, atol=2e-3)
@@ -126,7 +126,7 @@ def test_a_target_that_goes_is_forgotten_as_stone_soups_particles_forget_it(seed
 
 
 def half_hidden(updater, number=200):
-    """Return the existence after each of ten empty scans of a lane of which every second place is hidden."""
+    """Return the existence after each of ten empty scans of a lane whose second half is hidden."""
     from stonesoup.types.array import StateVectors
     from stonesoup.types.detection import MissedDetection
     from stonesoup.types.hypothesis import SingleHypothesis
@@ -154,8 +154,8 @@ def half_hidden(updater, number=200):
     return np.array(exists)
 
 
-def test_ten_empty_scans_of_a_lane_half_hidden_leave_what_the_hidden_half_may_hold():
-    """r (1 - pd) / (1 - r pd), with pd the share in view times the sensor's: down to 1/3, and no further."""
+def test_empty_scans_of_a_half_hidden_lane_leave_the_hidden_half():
+    """r (1 - pd) / (1 - r pd), with pd the visible share times that of the sensor; the limit is 1/3."""
     pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
     from stonesoup.updater.particle import VisibilityInformedBernoulliParticleUpdater as Stock
 
@@ -174,12 +174,12 @@ def test_ten_empty_scans_of_a_lane_half_hidden_leave_what_the_hidden_half_may_ho
         mine.append(sum(belief.explanations[:2]))
     np.testing.assert_allclose(mine, law, atol=1e-9)
     np.testing.assert_allclose(half_hidden(corrected(Stock)), law, atol=0.01)
-    # Stock, ten scans that find nothing change nothing.
+    # The stock updater ignores the ten empty scans.
     np.testing.assert_array_equal(half_hidden(Stock), 0.5)
     assert law[-1] == pytest.approx(1.0 / 3.0, abs=1e-3)
 
 
-def test_the_example_prints_what_stands_on_the_page(capsys):
+def test_the_example_prints_the_output_on_the_page(capsys):
     pytest.importorskip("stonesoup", reason="Stone Soup is the oracle: pip install 'worldstate[oracles]'")
     docs = Path(__file__).resolve().parents[2] / "docs"
     runpy.run_path(str(docs / "examples" / "stone_soup.py"), run_name="__main__")

@@ -1,4 +1,4 @@
-"""The watch over the budget: false alarms of its tests by simulation, and its laws in the filter."""
+"""The monitor of the alarm budget: false-positive rates by simulation, and its laws in the filter."""
 
 import json
 import math
@@ -24,7 +24,6 @@ from worldstate.core.budget_watch import (
     chance_factors,
     onset_factors,
 )
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.state import Budget
 
 CHANCES = st.floats(1e-6, 1.0 - 1e-6)
@@ -32,10 +31,10 @@ HOP_NS = 10**8
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.1, 200.0), st.floats(0.0, 60.0), st.integers(1, int(CLUSTER)))
-def test_false_onsets_bring_no_evidence_in_the_mean_up_to_the_budget(
+def test_onsets_within_the_budget_give_no_evidence_on_average(
     share: float, budget: float, step_s: float, cluster: int
 ) -> None:
-    """Clusters that come at random, of a rate of onsets up to the budget: log E e in closed form."""
+    """Random clusters with onsets up to the budget; log E e in closed form."""
     clusters = share * budget * step_s / 3600.0 / cluster
     nothing, one = onset_factors(0, step_s, budget), onset_factors(cluster, step_s, budget)
     for none, some in zip(nothing, one, strict=True):
@@ -43,21 +42,21 @@ def test_false_onsets_bring_no_evidence_in_the_mean_up_to_the_budget(
 
 
 @given(st.tuples(CHANCES, CHANCES), st.tuples(*[st.floats(-TOLERANCE_NATS, TOLERANCE_NATS)] * 2))
-def test_chances_bring_no_evidence_in_the_mean_within_the_tolerance(
+def test_probabilities_within_the_tolerance_give_no_evidence_on_average(
     stated: tuple[float, float], off_nats: tuple[float, float]
 ) -> None:
     odds = [p / (1.0 - p) * math.exp(nats) for p, nats in zip(stated, off_nats, strict=True)]
     true = [one / (1.0 + one) for one in odds]
     mean = np.zeros(2)
     for left in (False, True):
-        for right in (False, True):  # Each side by itself: their mean needs no more
+        for right in (False, True):  # The mean needs no joint distribution
             weight = np.prod([t if y else 1.0 - t for t, y in zip(true, (left, right), strict=True)])
             mean += weight * np.array(chance_factors(stated, (left, right)))
     assert (mean <= 1.0 + 1e-9).all()
 
 
 @pytest.mark.parametrize("cluster", [1, 2])
-def test_at_the_budget_it_is_broken_falsely_in_at_most_one_of_forty_days(cluster: int) -> None:
+def test_the_budget_breaks_falsely_on_at_most_one_day_in_forty(cluster: int) -> None:
     rng, step_s, budget, broken, days = np.random.default_rng(3), 60.0, 25.0, 0, 200
     for _ in range(days):
         found = Evidence((1.0,) * len(RATES))
@@ -71,10 +70,8 @@ def test_at_the_budget_it_is_broken_falsely_in_at_most_one_of_forty_days(cluster
 
 
 @pytest.mark.parametrize(("times", "within_h"), [(2.0, 2.0), (10.0, 0.25)])
-def test_what_exceeds_the_budget_is_found_and_what_has_ended_is_forgotten(
-    times: float, within_h: float
-) -> None:
-    """After six hours at three fifths of the budget, which must not count against what comes then."""
+def test_excess_is_detected_and_forgotten_after_it_ends(times: float, within_h: float) -> None:
+    """Six hours at 60 % of the budget must not delay the detection of later excess."""
     rng, step_s, budget, found_h, back_h = np.random.default_rng(5), 6.0, 25.0, list[float](), list[float]()
 
     def hours_until(evidence: Evidence, rate: float, broken: bool) -> tuple[Evidence, float]:
@@ -91,7 +88,7 @@ def test_what_exceeds_the_budget_is_found_and_what_has_ended_is_forgotten(
             evidence = evidence.after(onset_factors(n, 360.0, budget), 360.0)
         evidence, late_h = hours_until(evidence, times * budget, True)
         found_h.append(late_h)
-        for n in rng.poisson(times * budget * 0.1, 60).tolist():  # Six hours more make the way back no longer
+        for n in rng.poisson(times * budget * 0.1, 60).tolist():  # Six more hours do not delay the recovery
             evidence = evidence.after(onset_factors(n, 360.0, budget), 360.0)
         evidence = replace(evidence, broken=True)
         back_h.append(hours_until(evidence, 0.6 * budget, False)[1])
@@ -104,7 +101,7 @@ def hop(number: int, over: bool = False, came: int | None = None, looked: bool =
     return WatchedHop(number * HOP_NS, looked, (over, False), emerged_ns, (0.01, 0.01))
 
 
-def test_an_onset_is_false_where_nothing_comes_within_eight_seconds_before_or_after() -> None:
+def test_an_onset_is_false_without_a_vehicle_within_eight_seconds() -> None:
     def told(onsets: set[int], came: int | None, blind: set[int]) -> tuple[int, float]:
         watch = BudgetWatch()
         for number in range(401):
@@ -128,7 +125,7 @@ def budgets(measured: Iterator[Measurement] | list[Measurement]) -> list[Budget]
     return told
 
 
-def test_false_alarms_break_the_budget_and_move_no_threshold() -> None:
+def test_false_alarms_break_the_budget_and_keep_the_threshold() -> None:
     world, told = WorldFilter(start_ns=START_NS), []
     for one in false_alarms():
         world = world.update(one)
@@ -147,7 +144,7 @@ def test_false_alarms_break_the_budget_and_move_no_threshold() -> None:
     assert world.predict(3.0).state.budget.verdict == "unwatched"
 
 
-def test_what_was_asked_and_what_the_curve_promises_are_stated_if_a_budget_is() -> None:
+def test_the_requested_alpha_and_the_promise_are_published_with_a_budget() -> None:
     promise = AlarmPromise(4.0, 1.0, 9.0, 0.01, 0.002, 0.03)
     for asked_alpha, stated in ((None, 0.02), (0.015, 0.02), (None, 0.0)):
         alarm = replace(ALARM, asked_alpha=asked_alpha, promise=promise)
@@ -159,7 +156,7 @@ def test_what_was_asked_and_what_the_curve_promises_are_stated_if_a_budget_is() 
         assert {cue.alpha for cue in world.state.cues} == {promise.alpha if stated else None}
 
 
-def test_without_a_camera_nothing_watches_and_nothing_moves() -> None:
+def test_without_a_camera_the_budget_is_unwatched() -> None:
     told = budgets(false_alarms(camera=None, hops=200))
     assert {one.verdict for one in told} == {"unwatched"}
     assert {one.why for one in told} == {"no camera looks where vehicles come into view"}
@@ -174,7 +171,7 @@ def test_the_mirrored_street_and_renamed_sensors_have_the_same_budget() -> None:
     assert budgets([replace(one, source="ear") for one in false_alarms("another", hops=300)]) == here
 
 
-def test_a_checkpoint_and_what_comes_late_leave_the_budget_as_it_is() -> None:
+def test_checkpoints_and_late_measurements_leave_the_budget_unchanged() -> None:
     measured = list(false_alarms(hops=400))
     here = budgets(measured)
     world = WorldFilter(start_ns=START_NS)
@@ -189,24 +186,9 @@ def test_a_checkpoint_and_what_comes_late_leave_the_budget_as_it_is() -> None:
     assert budgets(late)[-1] == here[-1]
 
 
-def test_one_that_comes_into_view_is_counted_with_its_warning() -> None:
-    """It is heard for two seconds on the left and drives into the view there; weakly, after false alarms."""
+def test_an_arrival_is_counted_with_its_warning() -> None:
+    """A vehicle is audible on the left for two seconds before it is visible, then a weak one."""
     tally = budgets(list(arrival(1)))[-1].tally
     assert (tally.arrivals, tally.warned, tally.false_onsets) == (1, 1, 0)
     *_, last = budgets([*false_alarms(), *arrival(500, level=2.0)])
     assert (last.tally.arrivals, last.tally.warned) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    "watch",
-    [
-        replace(BudgetWatch(), over_ns=(None,)),
-        replace(BudgetWatch(), bet=(0, (0.1,))),
-        replace(BudgetWatch(), within=Evidence((1.0,))),
-        replace(BudgetWatch(), onsets=Evidence((0.0,) * len(RATES))),
-        replace(BudgetWatch(), onsets=Evidence((1e9,) * len(RATES))),
-    ],
-)
-def test_a_file_that_no_watch_was_written_to_is_refused(watch: BudgetWatch) -> None:
-    with pytest.raises(InvalidArgumentError, match=r"memory\.sequence\.watch"):
-        watch.check(2)

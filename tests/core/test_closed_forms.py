@@ -1,4 +1,4 @@
-"""What the formulas of the core give in cases that can be summed by hand, one law each."""
+"""Closed forms of the core in cases that can be summed by hand."""
 
 import math
 from dataclasses import replace
@@ -35,14 +35,14 @@ from worldstate.ground import LEAST_HEARD
 from worldstate.measurement import Bearing, CameraLook, Heard, Look, Sector
 
 SEEDS, UNIT = st.integers(0, 2**32 - 1), st.floats(0.01, 0.99)
-NATS, LARGE = st.floats(-4.0, 4.0), st.floats(0.0, 9.0)  # Large ones have to be limited
+NATS, LARGE = st.floats(-4.0, 4.0), st.floats(0.0, 9.0)  # Large values are limited
 SILENT, UNASKED = NotUsable("not scripted"), Unqueried("no camera")
 FLAT = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 COMING = len(COMING_S)
 SHARE = 0.9 * np.random.default_rng(0).dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
 LEFT, RIGHT = SideGeometry("left", 0.56, 0.96, 0.35), SideGeometry("right", -0.56, -0.96, 0.35)
 SITE = SiteGeometry((LEFT, RIGHT), 0.6, FilterSettings())
-# All of a reading or of a window is believed at once.
+# A reading or a window takes effect at once.
 WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, window_s=1e-3)
 
 
@@ -51,7 +51,7 @@ def odds(chance: float) -> float:
 
 
 def drawn(seed: int) -> np.ndarray:
-    """Return the groups of two sides that a sequence might read."""
+    """Return random groups of two sides."""
     rng = np.random.default_rng(seed)
     return 0.99 * rng.dirichlet(np.full(len(GROUPS), 0.3), 2) + 0.01 / len(GROUPS)
 
@@ -70,9 +70,7 @@ def said(
 @pytest.mark.parametrize("sequence", [False, True])
 @given(SEEDS, SEEDS, st.floats(LEAST_HEARD, 1.0))
 @settings(max_examples=10)
-def test_the_odds_of_what_is_masked_in_part_lie_between_it_and_what_was_expected(
-    sequence, one, other, share
-) -> None:
+def test_partly_masked_evidence_mixes_odds_of_reading_and_prediction(sequence, one, other, share) -> None:
     r"""Eq.: odds' = s odds(read) + (1 - s) odds(expected), of a vehicle that comes from any side."""
 
     def hop(number: int, seed: int, heard: float) -> Measurement:
@@ -85,19 +83,19 @@ def test_the_odds_of_what_is_masked_in_part_lie_between_it_and_what_was_expected
     read, masked = (before.update(hop(2, other, heard)).belief for heard in (1.0, share))
     mixed = share * odds(read.risk) + (1.0 - share) * odds(expected)
     assert odds(masked.risk) == pytest.approx(mixed, rel=1e-6)
-    # What is in view is heard as well as ever.
+    # The odds of visible and none do not depend on masking.
     visible, none = np.array([read.hypotheses, masked.hypotheses])[:, 1:].T
     assert visible[0] / none[0] == pytest.approx(visible[1] / none[1], rel=1e-6)
 
 
-def test_an_alarm_that_cannot_be_heard_any_more_ends_after_a_second_and_not_before() -> None:
+def test_an_alarm_ends_one_second_after_the_sound_becomes_unusable() -> None:
     loud, quiet = (SignatureEvidence(("left", "right"), (one, -3.0), -3.0, -one) for one in (6.0, -6.0))
     world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02))
     for hop in range(1, 11):
         world = world.update(said(hop, signature=loud))
     assert world.state.calibrated
     for hop in range(11, 24):
-        # Noise that sounds like an empty street, heard by nobody.
+        # Unusable noise that resembles an empty street.
         world = world.update(said(hop, heard=Heard(0.0, "lost samples"), signature=quiet))
         state = world.state
         named = any(cue.advisory is not None for cue in state.cues)
@@ -111,13 +109,13 @@ def test_an_alarm_that_cannot_be_heard_any_more_ends_after_a_second_and_not_befo
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_a_vehicle_on_any_side_is_as_likely_as_on_each_less_on_both(seed) -> None:
+def test_the_risk_of_any_side_is_the_sum_less_both(seed) -> None:
     sides = WorldFilter().update(said(1, drawn(seed))).belief
     assert sides.hidden_on(None) == pytest.approx(sum(sides.hidden) - sides.both) == pytest.approx(sides.risk)
 
 
 @given(UNIT, UNIT, UNIT, UNIT)
-def test_messages_make_the_explanations_give_way_alike(hidden, visible, one, other) -> None:
+def test_messages_scale_the_other_hypotheses_alike(hidden, visible, one, other) -> None:
     rest = 1.0 - hidden
     before = SideBelief(
         (hidden, 0.0), (0.0, 0.0), (hidden, 0.0), hidden, (hidden, rest * visible, rest * (1.0 - visible))
@@ -130,7 +128,7 @@ def test_messages_make_the_explanations_give_way_alike(hidden, visible, one, oth
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.01, 0.9))
-def test_a_look_finds_something_or_nothing_whatever_is_there(miss_rate, clutter_rate) -> None:
+def test_the_answers_of_a_look_sum_to_one(miss_rate, clutter_rate) -> None:
     nothing, something = (kind(miss_rate, clutter_rate).log_likelihoods() for kind in (Absent, Present))
     assert np.exp(nothing) + np.exp(something) == pytest.approx([1.0] * 3)
     assert np.exp(nothing) == pytest.approx((1.0 - clutter_rate) * np.array([1.0, miss_rate, 1.0]))
@@ -138,7 +136,7 @@ def test_a_look_finds_something_or_nothing_whatever_is_there(miss_rate, clutter_
 
 @given(SEEDS, UNIT)
 @settings(max_examples=20)
-def test_a_context_moves_the_odds_of_those_who_come_to_its_own_within_limits(seed, hidden) -> None:
+def test_a_context_moves_the_odds_to_its_prior_within_limits(seed, hidden) -> None:
     share = drawn(seed)[0]
     usual, moved = (
         math.log(odds(float(one[:COMING].sum()))) for one in (share, context_prior(share, hidden))
@@ -151,8 +149,8 @@ def test_a_context_moves_the_odds_of_those_who_come_to_its_own_within_limits(see
 
 @given(SEEDS, UNIT)
 @settings(max_examples=20)
-def test_a_vehicle_comes_behind_another_as_often_as_prior_and_sound_have_one_in_view(seed, by_sound) -> None:
-    """At most as often as the sound has one: else a camera that finds what it denies would hide another."""
+def test_a_hidden_vehicle_beside_a_visible_one_mixes_prior_and_sound(seed, by_sound) -> None:
+    """At most as often as the sound does; else a detection against it would add a hidden vehicle."""
     groups, usual = drawn(seed), 0.2
     rest = 1.0 - groups[:, :COMING].sum(axis=1) - groups[:, GROUPS.index("other")]
     in_view = (groups[:, COMING] / rest).mean()
@@ -181,7 +179,7 @@ def informed_by(kept: StreetBelief, groups: np.ndarray) -> StreetBelief:
 
 @given(SEEDS, UNIT)
 @settings(max_examples=20)
-def test_behind_one_that_has_come_into_view_another_comes_as_often_as_usual(seed, residual) -> None:
+def test_after_a_hand_over_the_usual_share_of_followers_remains(seed, residual) -> None:
     before = memory_of(drawn(seed))
     after = before.handed_over({0: residual}, (1,), 10**9, WHOLE)
     often = (1.0 - residual) * WHOLE.follows + residual * before.comes[0]
@@ -194,9 +192,7 @@ def test_behind_one_that_has_come_into_view_another_comes_as_often_as_usual(seed
 
 @given(SEEDS, st.tuples(LARGE, LARGE))
 @settings(max_examples=20)
-def test_of_the_less_likely_side_no_more_than_that_two_come_is_held_against_the_threshold(
-    seed, log_odds
-) -> None:
+def test_the_less_likely_side_is_limited_by_the_odds_of_two_vehicles(seed, log_odds) -> None:
     groups, nats = drawn(seed), np.array(log_odds)
     comes, alone = groups[:, :COMING].sum(axis=1), groups[:, GROUPS.index("other")]
     decided, less = of_two(nats, comes, alone, nats, 0.3), int(np.argmin(log_odds))
@@ -208,7 +204,7 @@ def test_of_the_less_likely_side_no_more_than_that_two_come_is_held_against_the_
 
 @given(SEEDS)
 @settings(max_examples=10)
-def test_what_was_learned_of_the_traffic_moves_the_prior_and_so_the_alarm_unless_one_is_given(seed) -> None:
+def test_learned_traffic_moves_prior_and_alarm_unless_a_prior_is_given(seed) -> None:
     groups = drawn(seed)
     busy = (ArrivalRate(20.0, 100.0), ArrivalRate(0.0, 6e3))
     usual, learned = (informed_by(memory_of(groups, **more), groups) for more in ({}, {"arrivals": busy}))
@@ -223,7 +219,7 @@ def test_what_was_learned_of_the_traffic_moves_the_prior_and_so_the_alarm_unless
 
 @given(SEEDS, st.integers(-(10**4), -10))
 @settings(max_examples=5)
-def test_an_alarm_does_not_depend_on_what_its_clock_counts_from(seed, start_s) -> None:
+def test_an_alarm_does_not_depend_on_the_origin_of_the_clock(seed, start_s) -> None:
     worlds = [WorldFilter(), WorldFilter(start_ns=start_s * 10**9)]
     for hop in range(1, 6):
         heard = said(hop, drawn(seed + hop))
@@ -237,7 +233,7 @@ def test_an_alarm_does_not_depend_on_what_its_clock_counts_from(seed, start_s) -
 
 @given(NATS, NATS, NATS, NATS, UNIT)
 @settings(max_examples=10)
-def test_the_statistic_is_that_of_one_window_whose_look_has_missed(left, right, visible, none, miss) -> None:
+def test_the_statistic_is_that_of_one_window_with_an_empty_look(left, right, visible, none, miss) -> None:
     one = said(10, signature=SignatureEvidence(("left", "right"), (left, right), visible, none))
     hidden, others = np.exp([left, right]).sum(), miss * math.exp(visible) + math.exp(none)
     cue = WorldFilter().update(replace(one, co_evidence=Absent(miss))).state.cues[0]
@@ -247,7 +243,7 @@ def test_the_statistic_is_that_of_one_window_whose_look_has_missed(left, right, 
 
 
 @pytest.mark.parametrize("sequence", [False, True])
-def test_a_budget_is_stated_of_the_rule_and_confidences_sum_to_one(sequence) -> None:
+def test_only_the_window_rule_has_alpha_and_confidences_sum_to_one(sequence) -> None:
     policy = replace(uncalibrated_policy(), alpha=0.02, risk_map=PlattMap(-0.5, -2.0))
     world = WorldFilter(policy=policy)
     for hop in range(1, 9):
@@ -257,12 +253,12 @@ def test_a_budget_is_stated_of_the_rule_and_confidences_sum_to_one(sequence) -> 
     cues = world.state.cues
     assert {cue.alpha for cue in cues} == {None if sequence else 0.02}
     assert sum(cue.confidence for cue in cues) == pytest.approx(1.0)
-    # A map that raises what is hidden is not followed: at most all of it comes.
+    # The risk is at most P(hidden), whatever the map returns.
     assert all(cue.risk <= cue.hypotheses.hidden + 1e-12 for cue in cues)
 
 
 @pytest.mark.parametrize("group", range(7))
-def test_the_interval_of_the_time_holds_nine_of_ten_of_a_group_and_its_margin(group) -> None:
+def test_the_time_interval_is_the_90_per_cent_interval_plus_margin(group) -> None:
     groups = np.full((1, 2, len(GROUPS)), 1e-12)
     groups[..., group] = 1.0
     begin, end = (0.0, *COMING_S)[group], COMING_S[group]
@@ -288,7 +284,7 @@ def box_scan(azimuth_rad: float, miss_rate: float, name: str = "camera", std_rad
 
 @given(st.floats(-0.1, 0.1), st.floats(0.1, 0.9), st.floats(0.05, 0.6))
 @settings(max_examples=20)
-def test_a_box_is_of_the_one_entity_there_or_of_a_new_one(apart, existence, miss_rate) -> None:
+def test_a_box_belongs_to_the_entity_or_a_new_one(apart, existence, miss_rate) -> None:
     detections = box_scan(0.1 + apart, miss_rate).detections
     variance, found = 0.05**2 + 0.02**2, 1.0 - miss_rate
     own = found * existence * math.exp(-0.5 * apart**2 / variance) / math.sqrt(2.0 * math.pi * variance)
@@ -297,7 +293,7 @@ def test_a_box_is_of_the_one_entity_there_or_of_a_new_one(apart, existence, miss
     assert whose.pairs[0, 0] == pytest.approx(own / (own + new), rel=1e-4)
 
 
-def test_one_in_view_takes_a_poor_detection_in_its_gate_before_a_new_one_is_born() -> None:
+def test_a_visible_entity_takes_a_poor_detection_in_its_gate() -> None:
     poor = np.array([[-1.0]])
     in_view, hidden = (joint_association(poor, np.array([detected])) for detected in (True, False))
     assert (in_view.found, in_view.new, hidden.found, hidden.new) == ({0: 0}, [], {}, [0])
@@ -305,7 +301,7 @@ def test_one_in_view_takes_a_poor_detection_in_its_gate_before_a_new_one_is_born
 
 @given(UNIT, UNIT)
 @settings(max_examples=10)
-def test_what_two_cameras_find_is_found_unless_both_miss_it(one, other) -> None:
+def test_two_cameras_miss_only_if_both_miss(one, other) -> None:
     scans = [box_scan(0.1, one, "a"), box_scan(0.1, other, "b", std_rad=0.04)]
     both, by_look = fused(scans)
     assert both.found == pytest.approx([1.0 - one * other]) and by_look.tolist() == [[True, True]]
@@ -317,7 +313,7 @@ def test_what_two_cameras_find_is_found_unless_both_miss_it(one, other) -> None:
 
 @given(st.floats(0.3, 1.4), st.floats(0.05, 0.4))
 @settings(max_examples=20)
-def test_a_hidden_vehicle_comes_past_its_edge_on_either_side_alike_and_sooner_when_near(azimuth, std) -> None:
+def test_emergence_is_symmetric_and_likelier_near_the_edge(azimuth, std) -> None:
     def near(side: int, way: float, at: float) -> float:
         motion = MotionBelief.around((way * at, 0.0, -0.2, 3.2), (std, 0.1, 0.1, 0.3))
         return reached_edge(replace(born("left", 0, 0.9, 0, SITE), side=side, motion=motion), SITE)
@@ -327,7 +323,7 @@ def test_a_hidden_vehicle_comes_past_its_edge_on_either_side_alike_and_sooner_wh
     assert near(0, 1.0, 0.5) > near(0, 1.0, 1.5)
 
 
-def test_one_in_five_is_heard_on_the_wrong_side() -> None:
+def test_emergence_on_the_wrong_side_has_the_confusion_rate() -> None:
     hidden = replace(born("left", 0, 0.9, 0, SITE), side=0)
     at_edges = (replace(box_scan(way * 0.56, 0.1).detections, width_rad=np.zeros(1)) for way in (1.0, -1.0))
     here, there = (emergence_density([hidden], one, SITE)[0, 0] for one in at_edges)
@@ -337,7 +333,7 @@ def test_one_in_five_is_heard_on_the_wrong_side() -> None:
 
 @given(st.floats(-0.5, 0.5), UNIT)
 @settings(max_examples=20)
-def test_a_peak_is_the_entitys_own_or_anywhere_ahead(apart, own_path) -> None:
+def test_a_peak_belongs_to_the_entity_or_is_uniform(apart, own_path) -> None:
     variance = 0.05**2 + 0.1**2
     own = own_path * math.exp(-0.5 * apart**2 / variance) / math.sqrt(2.0 * math.pi * variance)
     motion, path = Tracks.of([seen(0.1, 0.9)]).motion, np.array([own_path])
@@ -347,8 +343,8 @@ def test_a_peak_is_the_entitys_own_or_anywhere_ahead(apart, own_path) -> None:
 
 @given(st.floats(-1.0, 1.0), st.floats(-0.6, 0.6), st.floats(0.01, 0.3))
 @settings(max_examples=20)
-def test_a_peak_is_where_the_vehicle_was_as_long_ago_as_bearings_are_late(azimuth, rate, apart) -> None:
-    """As far ahead of that place and behind it, peaks move the vehicle as far, in opposite ways."""
+def test_a_peak_describes_the_vehicle_at_the_delay_of_bearings(azimuth, rate, apart) -> None:
+    """Peaks at equal distances ahead of and behind that place move the vehicle equally far."""
     motion = MotionBelief.around((azimuth, rate, -0.2, 3.2), (0.1, 0.3, 0.1, 0.3))
     late_rad, moved = azimuth - SITE.street.bearing_s * rate, list[np.ndarray]()
     for way in (1.0, -1.0):
@@ -363,9 +359,7 @@ def test_a_peak_is_where_the_vehicle_was_as_long_ago_as_bearings_are_late(azimut
 
 @given(UNIT, UNIT, UNIT)
 @settings(max_examples=20)
-def test_a_miss_makes_an_occluder_likelier_and_a_detection_denies_it_but_for_what_a_radar_finds(
-    before, detected, chance
-) -> None:
+def test_a_miss_raises_and_a_detection_lowers_occlusion(before, detected, chance) -> None:
     tracks = Tracks.of([replace(seen(0.1, 0.9), behind=before)])
     missed = before / (before + (1.0 - before) * (1.0 - detected))
     for by_radar, rate in ((False, 0.0), (True, SITE.street.hidden_return)):
@@ -379,7 +373,7 @@ def test_a_miss_makes_an_occluder_likelier_and_a_detection_denies_it_but_for_wha
     st.floats(-2.0, 9.0), st.floats(-0.3, 0.3), st.floats(4.0, 9.0),
 )  # fmt: skip
 @settings(max_examples=100)
-def test_at_its_time_to_visible_a_vehicle_stands_behind_the_corner_as_the_ego_vehicle_then_sees_it(
+def test_the_time_to_visible_is_the_crossing_of_the_line_of_sight(
     x, y, vx, vy, speed, turning, corner_m
 ) -> None:
     place = CartesianBelief(np.array([x, y, vx, vy]), np.diag([0.2, 0.2, 0.1, 0.1]))
@@ -388,7 +382,9 @@ def test_at_its_time_to_visible_a_vehicle_stands_behind_the_corner_as_the_ego_ve
             place, side, replace(SITE, ego_speed_mps=speed, ego_yaw_rate_rad_s=turning)
         )
         if times_s is not None and times_s[1] > 0.0:
-            driven_s = times_s[1] if side.corner_m else 0.0  # Past a corner at an unknown distance it stands
+            driven_s = (
+                times_s[1] if side.corner_m else 0.0
+            )  # The line of sight past a corner at unknown distance does not move
             ego, _ = arc(speed, turning, driven_s)
             corner = corner_m * np.array([math.cos(0.56), math.sin(0.56)]) - ego
             off = place.mean[:2] + times_s[1] * place.mean[2:] - ego
@@ -397,7 +393,7 @@ def test_at_its_time_to_visible_a_vehicle_stands_behind_the_corner_as_the_ego_ve
 
 
 @pytest.mark.parametrize("group", [1, 4, 7])
-def test_one_only_heard_goes_towards_the_axis_at_the_pace_of_its_lane(group) -> None:
+def test_a_hidden_vehicle_moves_towards_the_axis_at_the_pace_of_its_lane(group) -> None:
     coming = np.full(COMING, 1e-9)
     coming[group] = 1.0
     for side, way in ((LEFT, 1.0), (RIGHT, -1.0)):
@@ -409,7 +405,7 @@ def test_one_only_heard_goes_towards_the_axis_at_the_pace_of_its_lane(group) -> 
 
 @given(SEEDS)
 @settings(max_examples=10)
-def test_a_vehicle_in_view_has_the_mean_of_its_likeliest_side_and_the_errors_of_all(seed) -> None:
+def test_emerged_motion_has_the_likeliest_mean_and_the_total_covariance(seed) -> None:
     rng, before = np.random.default_rng(seed), LEFT.prior()
     coming, shares = drawn(seed)[:, :COMING], rng.dirichlet(np.ones(2))
     pairs = zip(coming, SITE.sides, strict=True)
@@ -420,7 +416,7 @@ def test_a_vehicle_in_view_has_the_mean_of_its_likeliest_side_and_the_errors_of_
     np.testing.assert_allclose(found.covariance, shares[0] * errors[0] + shares[1] * errors[1], atol=1e-12)
 
 
-def test_a_cue_names_an_entity_of_its_own_side_before_one_of_unknown_side() -> None:
+def test_a_cue_refers_to_its_own_side_before_unknown_sides() -> None:
     faint, likely = born("left", 0, 0.3, 0, SITE), born("left", 1, 0.6, 0, SITE)
     unknown = replace(born("right", 0, 0.9, 0, SITE), side=1, side_shares=(0.4, 0.6))
     assert hidden_on(Tracks.of([unknown, faint, likely]), 0) == 2

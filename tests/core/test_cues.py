@@ -1,4 +1,4 @@
-"""What a snapshot says beyond its entities: advisories in time, evidence, sensors, events, forecasts."""
+"""Snapshots beyond their entities: advisories over time, evidence, sensors, events, forecasts."""
 
 import math
 from dataclasses import replace
@@ -28,7 +28,7 @@ SOON = np.array(COMING_S) <= 3.0
 
 
 def script(rng: np.random.Generator, hops: int, sequence: bool) -> list[Measurement]:
-    """Return sound that wavers about its threshold, looks and boxes now and then, and gaps of two seconds."""
+    """Return sound near its threshold with some looks, boxes and gaps of two seconds."""
     measured, stamp_ns = [], 0
     for _ in range(hops):
         stamp_ns += 10**8 if rng.random() < 0.9 else 2 * 10**9
@@ -51,7 +51,7 @@ def run(measured: list[Measurement], world: WorldFilter | None = None) -> list[W
 
 @given(SEEDS, st.booleans())
 @settings(max_examples=2)
-def test_an_advisory_says_since_when_and_ends_when_it_says(seed: int, sequence: bool) -> None:
+def test_an_advisory_has_its_onset_and_ends_at_its_expiry(seed: int, sequence: bool) -> None:
     worlds = run(script(np.random.default_rng(seed), 20, sequence))
     since: dict[str, int] = {}
     for before, world in zip([None, *worlds], worlds, strict=False):
@@ -66,7 +66,7 @@ def test_an_advisory_says_since_when_and_ends_when_it_says(seed: int, sequence: 
             assert told.since_ns == since[cue.direction] <= world.stamp_ns <= told.valid_until_ns
             assert told.valid_until_ns - world.stamp_ns <= 1.005e9
             assert {one.sensor for one in told.sensors} <= {one.sensor for one in world.state.sensors}
-            if sequence:  # Nothing but time ends that of a sequence; the rule names the likelier side
+            if sequence:  # Only time ends an advisory of a sequence; the window rule takes the likelier side
                 assert _named(world.predict_to(told.valid_until_ns).state, cue.direction)
             assert not _named(world.predict_to(told.valid_until_ns + 1).state, cue.direction)
     assert since or not any(cue.advisory for cue in worlds[-1].state.cues)
@@ -78,7 +78,7 @@ def _named(state: WorldState, side: str) -> bool:
 
 @given(SEEDS, st.floats(0.01, 0.9))
 @settings(max_examples=3)
-def test_what_evidence_adds_to_a_sequence_adds_up_to_what_is_believed(seed: int, hidden: float) -> None:
+def test_evidence_terms_of_a_sequence_sum_to_the_log_odds(seed: int, hidden: float) -> None:
     context = Context(priors=Priors(hidden, 0.0, 1.0 - hidden))
     for world in run(script(np.random.default_rng(seed), 20, sequence=True), WorldFilter(context)):
         memory = world.memory
@@ -92,8 +92,8 @@ def test_what_evidence_adds_to_a_sequence_adds_up_to_what_is_believed(seed: int,
             assert cue.within is not None and cue.within["3"] == pytest.approx(soon)
 
 
-def test_a_look_that_finds_somebody_weighs_against_whoever_comes() -> None:
-    """Of a sound that is either in view or comes: an empty view is for one that comes."""
+def test_a_detection_counts_against_a_coming_vehicle() -> None:
+    """If the sound fits a visible and a coming vehicle, an empty look supports the coming one."""
     said, terms = script(np.random.default_rng(0), 1, sequence=True)[0], {}
     assert isinstance(said.sequence, SequenceReading)
     groups = np.full(said.sequence.groups.shape, 1e-3)
@@ -111,8 +111,8 @@ def test_a_look_that_finds_somebody_weighs_against_whoever_comes() -> None:
 
 @given(SEEDS)
 @settings(max_examples=3)
-def test_what_evidence_adds_to_windows_adds_up_to_the_log_odds_of_the_belief(seed: int) -> None:
-    """What the statistic of one window is stays apart: it holds the priors of the policy and no memory."""
+def test_evidence_terms_of_windows_sum_to_the_log_odds(seed: int) -> None:
+    """The statistic of one window is separate: it has the priors of the policy and no memory."""
     looked, two = False, False
     for world in run(script(np.random.default_rng(seed), 20, sequence=False)):
         look = _last(world)
@@ -123,7 +123,7 @@ def test_what_evidence_adds_to_windows_adds_up_to_the_log_odds_of_the_belief(see
             assert cue.evidence.hypothesis == "hidden" and next(iter(terms)) == "prior"
             assert ("window" in terms) == bool(world.memory.belief.joint.alone)
             assert sum(terms.values()) == pytest.approx(math.log(hidden / (1.0 - hidden)), abs=1e-9)
-            # Gamma is 0.9, and beside one that has just come into view it stands higher.
+            # Gamma is 0.9, and higher while a vehicle has just come into view.
             belief = world.memory.belief
             just_come = any(belief.emerged_since(belief.stamp_ns, StreetModel().beside_s))
             higher = StreetModel().beside_nats * just_come
@@ -134,8 +134,8 @@ def test_what_evidence_adds_to_windows_adds_up_to_the_log_odds_of_the_belief(see
 
 
 @pytest.mark.parametrize("sequence", [False, True])
-def test_an_advisory_that_messages_raise_says_so(sequence: bool) -> None:
-    """Nothing is heard on either side, and on the left a vehicle says where it is."""
+def test_an_advisory_of_messages_has_the_hypothesis_announced(sequence: bool) -> None:
+    """Both sides are quiet; a vehicle on the left sends its position."""
     flat = SignatureEvidence(("left", "right"), (-3.0, -3.0), -1.0, 1.0)
     said = SequenceReading(np.stack([SHARE, SHARE]), SHARE, 0.0, SequenceAlarm(2.5, 20.0))
     world = WorldFilter()
@@ -201,7 +201,7 @@ def test_a_scan_is_a_look_at_its_own_sector_and_a_message_at_none() -> None:
     assert [event.kind for event in world.state.events] == ["born"]
 
 
-def test_what_stands_behind_the_vehicle_has_azimuths_of_one_turn() -> None:
+def test_azimuths_behind_the_vehicle_are_wrapped() -> None:
     spread = ((0.1, 0.0), (0.0, 0.1))
     for centre_rad, half_rad, y_m in ((math.pi, 0.5, 0.0), (math.pi, 0.5, 1e-9), (0.7, math.pi, -1e-9)):
         scan = PositionScan("radar", 10**9, (Position((-10.0, y_m), spread),),
@@ -215,7 +215,7 @@ def test_what_stands_behind_the_vehicle_has_azimuths_of_one_turn() -> None:
         assert half_rad == math.pi or abs(ends.centre_rad) == pytest.approx(math.pi)
 
 
-def test_a_high_risk_without_sound_says_that_nothing_was_measured() -> None:
+def test_a_high_risk_without_sound_has_its_reason() -> None:
     slow = Context(rates=Rates(emergence_hz=0.02, departure_hz=0.02))
     heard = SignatureEvidence(("left", "right"), (8.0, 0.0), 0.0, 0.0)
     sound = [Measurement(hop * 10**8, heard, UNASKED, SILENT, SILENT) for hop in range(1, 20)]
@@ -273,8 +273,8 @@ def test_a_pass_is_born_handed_over_coasts_and_dies() -> None:
 
 @given(SEEDS)
 @settings(max_examples=5)
-def test_the_forecast_is_that_of_straight_lines(seed: int) -> None:
-    """Oracle: places and velocities drawn from the belief, each moved on its line and shaken."""
+def test_the_forecast_moves_on_straight_lines(seed: int) -> None:
+    """Oracle: positions and velocities drawn from the belief, each moved on a line with noise."""
     rng = np.random.default_rng(seed)
     flat = SignatureEvidence(("left", "right"), (-3.0, -3.0), 0.0, 0.0)
     box = Sighting(0.1, 0.02, "car", 0.9)
@@ -304,7 +304,7 @@ def test_classes_sum_to_one_and_the_hidden_have_a_sector(seed: int) -> None:
             assert math.fsum(kind.probability for kind in one.classification) == pytest.approx(1.0, abs=1e-6)
             hidden = one.status == "hidden"
             assert (one.sector_rad is not None) == hidden
-            # Of one that was in view before, boxes may still tell where it drives.
+            # A vehicle that was visible before may keep a forecast from its boxes.
             assert (one.forecast is None) == hidden or one.last_seen_ns is not None
         for cue in world.state.cues:
             right, left = cue.sector_rad
@@ -318,21 +318,21 @@ def box(hop: int, *azimuths: float) -> Measurement:
     return Measurement(hop * 10**8, heard, Present(0.3) if boxes else Absent(0.3), SILENT, SILENT, boxes)
 
 
-def test_when_one_of_two_boxes_of_a_car_is_left_one_car_is() -> None:
+def test_a_double_detection_of_a_car_becomes_one_entity() -> None:
     world = WorldFilter()
     for hop in range(1, 40):
         world = world.update(box(hop, 0.1, 0.13) if 2 <= hop < 8 else box(hop, 0.13))
     assert len(world.state.entities) == 1
 
 
-def test_two_of_which_each_is_found_stay_two() -> None:
+def test_two_detected_cars_stay_two() -> None:
     world = WorldFilter()
     for hop in range(1, 40):
         world = world.update(box(hop, 0.1, 0.13))
     assert len(world.state.entities) == 2
 
 
-def test_one_vehicle_heard_on_both_sides_is_one_when_it_comes_into_view() -> None:
+def test_a_vehicle_of_both_sides_is_one_entity_at_the_hand_over() -> None:
     told: list[Event] = []
     both, none = (SignatureEvidence(("left", "right"), (one, one), 0.0, 0.0) for one in (4.0, -4.0))
     world = WorldFilter()
@@ -348,8 +348,8 @@ def test_one_vehicle_heard_on_both_sides_is_one_when_it_comes_into_view() -> Non
     assert [one.kind for one in told] == ["born", "handed_over"]
 
 
-def test_a_relation_says_since_when_it_holds_and_until_when_it_did() -> None:
-    """Occluded from the birth to the hand-over, and that is told for five more seconds."""
+def test_a_relation_has_its_start_and_end() -> None:
+    """`occluded_by` holds from the birth to the hand-over and stays listed for five more seconds."""
     loud, quiet = (SignatureEvidence(("left", "right"), (one, -1.0), 0.0, 0.0) for one in (6.0, -4.0))
     told, world = {}, WorldFilter()
     for hop in range(1, 95):
@@ -370,8 +370,8 @@ def test_a_relation_says_since_when_it_holds_and_until_when_it_did() -> None:
 
 @pytest.mark.parametrize("reads", [True, False])
 @pytest.mark.parametrize("none", [2.0, 4.0])
-def test_one_silent_in_view_makes_no_hidden_vehicle(reads: bool, none: float) -> None:
-    """A person in view for ten seconds, of whom the sound has nothing."""
+def test_a_silent_visible_person_makes_no_hidden_vehicle(reads: bool, none: float) -> None:
+    """A silent person is visible for ten seconds."""
     share = np.full(len(GROUPS), 0.02)
     share[[GROUPS.index("none"), GROUPS.index("seen")]] = 0.5, 0.2
     groups = np.full((2, len(GROUPS)), 0.002)

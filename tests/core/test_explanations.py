@@ -1,4 +1,4 @@
-"""The explanations by windows in the joint belief: laws over random inputs, and oracles beside our code."""
+"""Hypotheses from windows in the joint belief: laws over random inputs, and oracles."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from worldstate.state import Priors, Rates, blind_corner
 SIDES = ("left", "right", "rear")
 CORNERS = (blind_corner("left", 1), blind_corner("right", -1), replace(blind_corner("rear", 1), id="rear"))
 UNASKED = Unqueried("-")
-# The camera works, and a window is believed as it is: the memory is far shorter than any step.
+# The camera works, and a window takes full effect because the memory is shorter than any step.
 AT_ONCE = FilterSettings(street=StreetModel(works=1.0, fails_s=1e6, window_s=1e-3))
 nats = st.floats(-5.0, 5.0)
 steps_ns = st.integers(5 * 10**7, 2 * 10**9)
@@ -42,7 +42,7 @@ def street(k: int, **options: Priors | Rates | None) -> WorldFilter:
 
 
 def eq_6(priors: tuple[float, ...], values: tuple[float, ...]) -> np.ndarray:
-    """Return the posteriors of eq. (6) by sums over who comes: sides are independent, any is heard."""
+    """Return the posteriors of eq. (6) by sums over subsets of sides, which are independent."""
     *hidden, visible, none = np.exp(np.array(values) - max(values))
     k, (p_hidden, p_visible, p_none) = len(hidden), priors
     each, total = 1.0 - (1.0 - p_hidden) ** (1.0 / k), 0.0
@@ -56,7 +56,7 @@ def eq_6(priors: tuple[float, ...], values: tuple[float, ...]) -> np.ndarray:
 @pytest.mark.parametrize("k", [1, 2, 3])
 @given(chances, st.data())
 @settings(max_examples=8, deadline=None)
-def test_a_window_alone_is_believed_as_eq_6_says_whatever_was_heard_before(
+def test_a_single_window_gives_eq_6_whatever_came_before(
     k: int, priors: tuple[float, float, float], data: st.DataObject
 ) -> None:
     world, stamp_ns = street(k, priors=Priors(*priors)), 0
@@ -72,7 +72,7 @@ def test_a_window_alone_is_believed_as_eq_6_says_whatever_was_heard_before(
 @pytest.mark.parametrize("k", [1, 2, 3])
 @given(st.data())
 @settings(max_examples=6, deadline=None)
-def test_it_sums_to_one_and_stays_finite(k: int, data: st.DataObject) -> None:
+def test_hypotheses_sum_to_one_and_stay_finite(k: int, data: st.DataObject) -> None:
     world, stamp_ns = street(k), 0
     for _ in range(4):
         stamp_ns += data.draw(steps_ns)
@@ -87,10 +87,10 @@ def test_it_sums_to_one_and_stays_finite(k: int, data: st.DataObject) -> None:
 
 @given(st.tuples(nats, nats, nats, nats))
 @settings(max_examples=20, deadline=None)
-def test_a_blind_camera_moves_nothing_and_a_perfect_one_removes_what_is_in_view(
+def test_a_blind_camera_changes_nothing_and_a_perfect_one_excludes_visible(
     values: tuple[float, float, float, float],
 ) -> None:
-    """Law 2, between nothing that is asked and nothing that is missed."""
+    """Law 2 for miss rates of one and zero."""
     unasked, blind, perfect = (
         street(2).update(window(10**9, values, answer)).belief
         for answer in (UNASKED, Absent(1.0), Absent(0.0))
@@ -122,8 +122,8 @@ def test_the_prior_of_rates_is_their_equilibrium(rates: tuple[float, ...], k: in
     )
 
 
-def test_what_came_into_view_is_remembered_by_side() -> None:
-    """A hidden source that merely stops being hidden is still the one that was heard before."""
+def test_an_emerged_vehicle_keeps_its_side() -> None:
+    """A hidden vehicle that becomes visible keeps its side of origin."""
     world = WorldFilter()
     for hop in range(1, 61):
         heard = (5.0, 0.0, 0.0, 0.0) if hop <= 30 else (0.0, 0.0, 5.0, 0.0)

@@ -45,7 +45,7 @@ SECOND_NS, HOUR_NS = 10**9, 3600 * 10**9
 
 
 def extreme(rng: np.random.Generator, low: float, high: float) -> float:
-    """Return an end of a range, what rounds to nothing, or anything between, equally often as not."""
+    """Return an end of a range, a value near zero, or a uniform value."""
     kind = rng.random()
     if kind < 0.2:
         return low if kind < 0.1 else high
@@ -100,7 +100,7 @@ def measurement(rng: np.random.Generator, stamp_ns: int) -> Measurement:
 
 
 def scan(rng: np.random.Generator, stamp_ns: int) -> PositionScan:
-    """Return positions of the whole accepted range, from nobody to all that one scan may hold."""
+    """Return positions over the whole accepted range, from none to the maximum of one scan."""
     searched = None
     if rng.random() < 0.5:
         sector = Sector(extreme(rng, -np.pi, np.pi), max(extreme(rng, 0.0, np.pi), TINY))
@@ -124,7 +124,7 @@ def position(rng: np.random.Generator) -> Position:
 
 
 def odometry(rng: np.random.Generator, stamp_ns: int) -> Odometry:
-    """Return a drive of the whole accepted range, now and then from somewhere else on the map."""
+    """Return odometry over the whole accepted range, sometimes with a distant pose."""
     at = (extreme(rng, -1e6, 1e6), extreme(rng, -1e6, 1e6)), extreme(rng, -np.pi, np.pi)
     stds = max(extreme(rng, 0.0, 1e3), TINY), max(extreme(rng, 0.0, np.pi), TINY)
     near = EgoPose((float(rng.uniform(-5.0, 5.0)), 0.0), float(rng.uniform(-0.5, 0.5)))
@@ -141,17 +141,17 @@ def something(rng: np.random.Generator, stamp_ns: int) -> Measurement | Position
     return scan(rng, stamp_ns) if kind < 0.35 else measurement(rng, stamp_ns)
 
 
-# Corners that an ego vehicle passes and leaves behind, as odometry throws it about.
+# Corners that the ego vehicle passes as its odometry changes.
 PLACE = Context(occluders=(corner_at("left", (8.0, 3.0), 12.0), corner_at("right", (8.0, -4.0), 12.0)))
 
 
-# Of all sources and sensors.
+# The names of all sources and sensors.
 NAMES = ("acoustic", "camera", "left", "lidar", "radar", "right", "v2x", "wheels")
 Timed = TypeVar("Timed", Measurement, PositionScan, Odometry)
 
 
 def renamed(one: Timed, names: dict[str, str], rng: np.random.Generator) -> Timed:
-    """Return a measurement of sources and sensors of other names, all that has no order in another one."""
+    """Return a measurement with other names, and with unordered items in another order."""
 
     def look(told: Look) -> Look:
         return replace(told, sensor=names[told.sensor])
@@ -170,7 +170,7 @@ def renamed(one: Timed, names: dict[str, str], rng: np.random.Generator) -> Time
 
 
 def numbers(state: WorldState, names: dict[str, str]) -> dict[str, object]:
-    """Return all that a state holds by its place in it, with other names of sources and sensors."""
+    """Return all values of a state by their path, with other names of sources and sensors."""
     found: dict[str, object] = {}
 
     def note(place: str, value: object) -> None:
@@ -191,7 +191,7 @@ def numbers(state: WorldState, names: dict[str, str]) -> dict[str, object]:
 
 
 def campaign(rng: np.random.Generator, steps: int) -> WorldFilter:
-    """Filter what comes, and the same by other names and in another order; hold every state to the laws."""
+    """Filter random inputs, also renamed and reordered, and check every state against the laws."""
     others = [str(one) for one in rng.permutation([*NAMES, *(f"sensor {one}" for one in NAMES)])]
     names, order = dict(zip(NAMES, others, strict=False)), np.random.default_rng(0)
     first = {name: one for one, name in names.items()}
@@ -221,13 +221,13 @@ def campaign(rng: np.random.Generator, steps: int) -> WorldFilter:
     return world
 
 
-def test_what_is_accepted_leaves_a_sound_state_and_a_checkpoint_that_reads() -> None:
+def test_accepted_measurements_keep_state_and_checkpoint_valid() -> None:
     world = campaign(np.random.default_rng(1), 700)
     assert world.state.delivery.replayed > 20 and world.state.delivery.repeated > 10
 
 
 def crowd(rng: np.random.Generator, n: int) -> tuple[Sighting, ...]:
-    """Return boxes all over an image, a third of them parked."""
+    """Return boxes across an image, a third of them parked."""
     azimuths_rad, scores = rng.uniform(-0.55, 0.55, n).tolist(), rng.uniform(0.3, 1.0, n).tolist()
     drawn = zip(azimuths_rad, scores, rng.random(n) < 0.67, strict=True)
     return tuple(Sighting(at, 0.01, "car", score, moving=bool(moves)) for at, score, moves in drawn)
@@ -239,7 +239,7 @@ def crowded(hop: int, boxes: tuple[Sighting, ...], hidden: float = 0.0) -> Measu
     return Measurement(hop * 10**8, heard, answer, SILENT, SILENT, boxes)
 
 
-def test_of_600_boxes_an_image_64_count() -> None:
+def test_at_most_64_boxes_of_an_image_are_used() -> None:
     rng = np.random.default_rng(5)
     boxes = crowd(rng, 600)
     counting = sorted(boxes, key=lambda one: (not one.moving, -one.score))[:64]
@@ -248,21 +248,21 @@ def test_of_600_boxes_an_image_64_count() -> None:
     few = WorldFilter().update(crowded(1, tuple(counting)))
     assert few.state.delivery == Delivery()
     assert world.state == replace(few.state, delivery=Delivery(boxes_left_out=536))
-    again = world.update(crowded(1, boxes))  # Delivered twice, it is left out once
+    again = world.update(crowded(1, boxes))  # A repeated delivery does not count its boxes again
     assert again.state.delivery == Delivery(boxes_left_out=536, repeated=1)
-    # Of each image of its own
+    # The limit applies to each image.
     camera = CameraLook(Look("left", 10**8, Present(0.04, 0.01), (0.5, 1.5)), crowd(rng, 70))
     both = WorldFilter().update(replace(crowded(1, boxes[:66]), further=(camera,)))
     assert both.state.delivery.boxes_left_out == 2 + 6
 
 
-def test_the_128_likeliest_are_kept_and_what_is_only_heard() -> None:
+def test_the_128_likeliest_and_hidden_entities_are_kept() -> None:
     rng, world = np.random.default_rng(6), WorldFilter()
     for hop in range(1, 12):
         world = world.update(crowded(hop, (), hidden=4.0))
     (hidden,) = world.state.entities
     for hop in range(12, 16):
-        # As claims of a radio, which need no corner to appear at.
+        # Positions of a radio may appear anywhere.
         claims = tuple(
             Position(tuple(rng.uniform(5.0, 90.0, 2).tolist()), ((0.2, 0.0), (0.0, 0.2)), None, chance)
             for chance in rng.uniform(0.1, 0.9, 100).tolist()
@@ -274,8 +274,8 @@ def test_the_128_likeliest_are_kept_and_what_is_only_heard() -> None:
     assert len(state.entities) <= 128 and hidden.id in [one.id for one in state.entities]
     assert state.delivery.tracks_left_out > 50
     chances = [one.existence_probability for one in state.entities if one.id != hidden.id]
-    assert min(chances) > 0.25  # Claims begin at .1
-    # Counted since the filter began, also where the belief begins anew.
+    assert min(chances) > 0.25  # Claims begin at 0.1
+    # The counters continue if the belief is reset.
     last = crowded(1, ())
     anew = [
         world := world.update(replace(last, stamp_ns=last.stamp_ns - at)) for at in (2 * HOUR_NS, HOUR_NS)
@@ -283,7 +283,7 @@ def test_the_128_likeliest_are_kept_and_what_is_only_heard() -> None:
     assert anew.state.delivery == replace(state.delivery, too_late=1, reanchored=1)
 
 
-def test_sources_and_sensors_unheard_for_an_hour_are_forgotten() -> None:
+def test_sources_silent_for_an_hour_are_forgotten() -> None:
     def told(hop: int, name: str, world: WorldFilter) -> WorldFilter:
         look = Look(f"camera {name}", hop * 10**8, Absent(0.04, 0.01))
         world = world.update(replace(crowded(hop, (), hidden=-4.0), source=f"sound {name}", look=look))
@@ -307,8 +307,8 @@ def test_sources_and_sensors_unheard_for_an_hour_are_forgotten() -> None:
 
 
 @pytest.mark.parametrize("off_ns", [-HOUR_NS, 3 * SECOND_NS, HOUR_NS])
-def test_a_look_of_another_time_says_nothing_and_hides_no_later_one(off_ns: int) -> None:
-    """Of a camera that stands still, or of one stray stamp."""
+def test_a_look_with_a_wrong_stamp_is_ignored(off_ns: int) -> None:
+    """The clock of the camera has stopped, or one stamp is wrong."""
     rng, stamp_ns = np.random.default_rng(7), 2 * HOUR_NS
     quiet, world = WorldFilter(start_ns=stamp_ns), WorldFilter(start_ns=stamp_ns)
     for hop in range(1, 5):
@@ -341,5 +341,5 @@ def test_every_snapshot_of_twenty_demos_holds_to_the_laws(tmp_path: Path) -> Non
             assert broken_laws(state, before) == [], seed
             before, raised = state, raised or any(cue.advisory for cue in state.cues)
         advised += raised
-    # Nine in ten are warned of.
+    # At least 90 % are announced.
     assert advised >= 18

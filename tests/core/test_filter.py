@@ -15,10 +15,9 @@ from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
 from worldstate.abduction.evidence import SignatureEvidence, statistic
 from worldstate.belief.street_model import StreetModel
-from worldstate.belief.track import after_empty_look
 from worldstate.core.acoustic_update import acoustic_update
 from worldstate.core.site_model import site_geometry_of
-from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import NotUsable
 from worldstate.measurement import Approach, Bearing, Look
 from worldstate.state import Priors
@@ -64,7 +63,7 @@ def hops(first_s, last_s):
 
 
 def approach_from_left(t0_s=5.0):
-    """Quiet, heard hidden on the left for three seconds, seen for two while it crosses, gone."""
+    """Yield a hidden vehicle on the left for 3 s, a visible one for 2 s, and quiet hops around them."""
     for t in hops(1.0, 2.0):
         yield measured(t, QUIET)
     for t in hops(2.0, t0_s):
@@ -77,7 +76,7 @@ def approach_from_left(t0_s=5.0):
 
 
 def mirrored(measurement):
-    """The same world seen in a mirror."""
+    """Return the mirrored measurement."""
 
     def flip(value):
         return value if isinstance(value, NotUsable) else replace(value, azimuth_rad=-value.azimuth_rad)
@@ -109,8 +108,8 @@ def test_hidden_then_visible_with_the_same_id():
     assert states[-1].entities == ()
 
 
-def test_the_advisory_follows_the_log_odds_of_any_side_leads_and_points_at_the_entity():
-    """The mean of three hops at or above logit gamma, which is held for a second."""
+def test_the_advisory_follows_the_log_odds_and_refers_to_the_entity():
+    """The mean log-odds of three hops reach logit gamma; the advisory is held for a second."""
     world, nats, named, cues = start(), [], [], []
     for measurement in approach_from_left():
         world = world.update(measurement)
@@ -127,8 +126,8 @@ def test_the_advisory_follows_the_log_odds_of_any_side_leads_and_points_at_the_e
     assert all(cue.entity_id is not None and cue.alpha == 0.02 for cue in cues)
 
 
-def test_a_tie_names_both_sides():
-    """Rounding must not choose a side: the mirrored world would choose the other one."""
+def test_equal_sides_are_both_advised():
+    """Rounding must not decide between equal sides, because the mirrored world would differ."""
     even, either = (0.49, 0.49, 0.01, 0.01), replace(POLICY, gamma=0.4)  # Of one vehicle each has half
     for classes in (even, (0.49 + 1e-15, 0.49 - 1e-15, 0.01, 0.01)):
         world, _ = run(WorldFilter(policy=either), [measured(t, classes) for t in hops(1.0, 1.5)])
@@ -146,7 +145,7 @@ def test_relations_follow_the_entity():
     assert at[4_500_000_000].graph().has_edge(hidden["occluded_by"].src, "corner_left")
 
 
-def test_looming_becomes_time_to_arrival_and_its_lack_is_unknown():
+def test_looming_gives_the_time_to_arrival_or_it_is_unknown():
     world, _ = run(start(), [measured(t, LEFT, approach=Approach(0.5, 0.2)) for t in hops(1.0, 4.0)])
     (entity,) = world.state.entities
     assert entity.inverse_tta_hz == pytest.approx(0.5, abs=0.15)
@@ -156,17 +155,11 @@ def test_looming_becomes_time_to_arrival_and_its_lack_is_unknown():
     assert {r.kind: r.probability for r in world.state.relations}["approaching"] < 0.5
     world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
     (entity,) = world.state.entities
-    assert (entity.inverse_tta_hz, entity.tta_s) == (None, None)
-
-
-def test_an_assumed_approach_is_not_published():
-    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
-    (entity,) = world.state.entities
     assert (entity.inverse_tta_hz, entity.tta_s, world.state.cues[0].horizon_s) == (None, None, None)
 
 
 def test_an_old_approach_rate_fades():
-    """SourceEvidence to close at 0.8 1/s, then seen for three seconds and not heard to approach."""
+    """Approach at 0.8 1/s, then visible for three seconds without an approach rate."""
     script = [measured(t, LEFT, approach=Approach(0.8, 0.1)) for t in hops(1.0, 4.0)]
     script += [measured(t, FRONT, car(0.4)) for t in hops(4.0, 7.0)]
     _, states = run(start(), script)
@@ -175,7 +168,7 @@ def test_an_old_approach_rate_fades():
     assert abs(states[-1].entities[0].inverse_tta_hz) < 0.4
 
 
-def test_a_hidden_azimuth_says_that_it_may_be_biased():
+def test_a_hidden_azimuth_includes_the_possible_bias():
     peak = Bearing(0.6, 0.06, 1.4)
     world, _ = run(start(), [measured(t, LEFT, bearing=peak) for t in hops(1.0, 6.0)])
     spread = world.memory.tracks.azimuth_std_rad[0]
@@ -183,7 +176,7 @@ def test_a_hidden_azimuth_says_that_it_may_be_biased():
     assert world.state.cues[0].azimuth_std_rad == pytest.approx(math.hypot(spread, math.radians(10.0)))
 
 
-def test_the_sound_from_before_a_hand_over_brings_forth_nobody():
+def test_sound_from_before_a_hand_over_makes_no_new_entity():
     off = Unqueried("sector out of view")
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
     script += [measured(t, LEFT, car(0.5), answer=off) for t in hops(4.0, 4.9)]
@@ -194,7 +187,7 @@ def test_the_sound_from_before_a_hand_over_brings_forth_nobody():
 
 
 def test_the_side_comes_from_the_signature_and_not_from_the_peak():
-    """Most peaks of a hidden vehicle stand on images in the walls of the other side."""
+    """Most peaks of a hidden vehicle are reflections in the walls of the other side."""
     wrong = Bearing(-0.9, 0.06, 1.4)
     world, _ = run(start(), [measured(t, LEFT, bearing=wrong) for t in hops(1.0, 4.0)])
     (entity,) = world.state.entities
@@ -202,13 +195,13 @@ def test_the_side_comes_from_the_signature_and_not_from_the_peak():
     assert entity.azimuth_rad > 0.5
 
 
-def test_vision_unqueried_throughout():
-    """Moving ego, no camera: hidden, then heard in line of sight, one entity, never called visible."""
+def test_without_a_camera_an_entity_emerges():
+    """Without a camera one entity is hidden, then emerged, and never visible."""
     off = Unqueried("no detections")
     script = [measured(t, QUIET, answer=off) for t in hops(1.0, 2.0)]
     script += [measured(t, LEFT, answer=off) for t in hops(2.0, 5.0)]
     script += [measured(t, FRONT, answer=off, bearing=Bearing(0.2, 0.06, 1.6)) for t in hops(5.0, 8.0)]
-    # In three seconds on average it has passed; without a camera nothing shows that sooner.
+    # A pass takes three seconds on average; without a camera nothing shows its end earlier.
     script += [measured(t, QUIET, answer=off) for t in hops(8.0, 16.0)]
     _, states = run(start(), script)
     assert len({e.id for s in states for e in s.entities}) == 1
@@ -221,7 +214,7 @@ def test_vision_unqueried_throughout():
 
 
 def test_two_vehicles_one_seen_and_one_hidden():
-    """A vehicle in plain view does not explain away another one, as long as the bearing leads elsewhere."""
+    """A visible vehicle does not explain the evidence of a hidden one on the other side."""
     script = [measured(t, RIGHT) for t in hops(1.0, 4.0)]
     script += [measured(t, FRONT, car(-0.5 + 0.02 * (t - 4.0))) for t in hops(4.0, 6.0)]
     script += [measured(t, LEFT, car(-0.46), answer=Absent(0.04)) for t in hops(6.0, 9.0)]
@@ -238,7 +231,7 @@ def test_two_vehicles_one_seen_and_one_hidden():
 
 
 def test_two_hidden_vehicles_hand_over_to_their_own_sides():
-    """Where vehicles are usual on both sides, what is heard on both is two."""
+    """If vehicles are usual on both sides, evidence of both sides makes two entities."""
     both, busy = (0.49, 0.49, 0.01, 0.01), Context(hidden_by_side={"left": 0.8, "right": 0.8})
     script = [measured(t, both) for t in hops(1.0, 4.0)]
     script += [measured(t, both, car(0.5), car(-0.5)) for t in hops(4.0, 4.5)]
@@ -249,8 +242,8 @@ def test_two_hidden_vehicles_hand_over_to_their_own_sides():
     assert {("left" if e.azimuth_rad > 0 else "right"): e.id for e in seen} == before
 
 
-def test_a_vehicle_heard_on_the_wrong_side_is_still_the_one_heard():
-    """One vehicle that the signature misplaces is likelier than two of which one is silent."""
+def test_a_vehicle_on_the_wrong_side_keeps_its_identity():
+    """One vehicle on the wrong side is likelier than a hidden one and a silent visible one."""
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(4.0, FRONT, car(-0.5))]
     _, states = run(start(), script)
     (before,), (after,) = states[-2].entities, states[-1].entities
@@ -258,8 +251,8 @@ def test_a_vehicle_heard_on_the_wrong_side_is_still_the_one_heard():
     assert after.direction == "right"
 
 
-def test_a_missed_frame_just_after_hand_over_is_no_new_hazard():
-    """The window still holds the sound from before: until it has passed, no window moves the belief."""
+def test_a_missed_image_after_a_hand_over_is_no_new_hazard():
+    """The window still holds the sound from before the hand-over, so it does not change the belief."""
     script = [measured(t, LEFT) for t in hops(1.0, 3.0)] + [measured(3.0, LEFT, car(0.5))]
     world, _ = run(start(), script)
     missed, quiet = (world.update(measured(3.1, one, answer=Absent(0.1))) for one in (LEFT, QUIET))
@@ -301,7 +294,7 @@ def test_a_parked_car_is_context_and_no_hand_over():
     assert [(e.status, e.moving) for e in states[-1].entities] == [("visible", False), ("hidden", True)]
 
 
-def test_a_parked_car_that_comes_to_notice_takes_nobodys_place():
+def test_a_newly_detected_parked_car_replaces_no_hidden_entity():
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
     script += [measured(4.0, LEFT, car(0.5, moving=False), answer=Absent(0.04))]
     _, states = run(start(), script)
@@ -318,8 +311,8 @@ def test_a_parked_car_drives_off():
     assert entity.azimuth_rate_rad_s == pytest.approx(-0.6, abs=0.1)
 
 
-def test_one_in_view_is_no_part_of_the_next_one_that_is_heard_behind_it():
-    """It has a track: of one that is only heard no more exists than is hidden."""
+def test_a_visible_vehicle_does_not_raise_the_next_hidden_one():
+    """A visible vehicle has a track; the existence of the next one is only its hidden probability."""
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
     in_view = [car(0.5 - 0.3 * (t - 4.0)) for t in hops(4.0, 7.5)]
     script += [measured(t, FRONT, one) for t, one in zip(hops(4.0, 5.5), in_view, strict=False)]
@@ -342,8 +335,8 @@ def test_a_moving_car_drives_past_a_parked_one():
     assert len(states[-1].entities) == 2
 
 
-def test_a_standing_bearing_is_no_collision():
-    """Seen at one place for long and never heard to approach: it stays there."""
+def test_a_constant_bearing_stays_constant():
+    """A sighting at a constant azimuth without an approach rate keeps its azimuth."""
     script = [measured(t, FRONT, car(-0.46)) for t in hops(1.0, 15.0)]
     _, states = run(start(), script)
     (entity,) = states[-1].entities
@@ -351,7 +344,7 @@ def test_a_standing_bearing_is_no_collision():
     assert {e.id for s in states for e in s.entities} == {entity.id}
 
 
-def test_seen_without_being_heard_is_an_entity_of_its_own():
+def test_a_sighting_without_sound_is_an_entity():
     world, _ = run(start(), [measured(t, QUIET, car(0.3)) for t in hops(1.0, 1.5)])
     (entity,) = world.state.entities
     assert entity.status == "visible"
@@ -359,8 +352,8 @@ def test_seen_without_being_heard_is_an_entity_of_its_own():
 
 
 @pytest.mark.parametrize("miss_rate", [0.04, 0.3, 0.9])
-def test_empty_looks_move_existence_as_bernoulli_says(miss_rate):
-    """One look an interval counts in full: r (1 - pd) / (1 - r pd), times survival."""
+def test_empty_looks_follow_the_bernoulli_update(miss_rate):
+    """One look per correlation time counts in full: r (1 - pd) / (1 - r pd), times survival."""
     settings_ = FilterSettings(window_s=0.1, street=StreetModel(look_s=0.1))
     world = start(settings=settings_).update(measured(1.0, FRONT, car(0.0)))
     (before,) = world.state.entities
@@ -372,8 +365,8 @@ def test_empty_looks_move_existence_as_bernoulli_says(miss_rate):
     assert after.visibility.answer == "absent"
 
 
-def test_looks_in_quick_succession_count_for_their_share():
-    """Three looks within one interval weigh as one."""
+def test_looks_within_a_correlation_time_count_in_part():
+    """Three looks within one correlation time count as one."""
     world = start().update(measured(1.0, FRONT, car(0.0)))
     r = world.state.entities[0].existence_probability
     for t in (1.1, 1.2, 1.3):
@@ -385,7 +378,7 @@ def test_looks_in_quick_succession_count_for_their_share():
     assert world.state.entities[0].existence_probability == pytest.approx(r)
 
 
-def test_a_hand_over_takes_the_risk_with_it():
+def test_a_hand_over_lowers_the_risk():
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
     script.append(measured(4.0, LEFT, car(0.5), answer=Unqueried("sector out of view")))
     _, states = run(start(), script)
@@ -394,7 +387,7 @@ def test_a_hand_over_takes_the_risk_with_it():
     assert states[-1].cues[0].hypotheses.visible > 0.7
 
 
-def test_not_looking_moves_nothing_but_survival():
+def test_an_unqueried_camera_leaves_only_survival():
     world = start().update(measured(1.0, FRONT, car(0.0)))
     before = world.state.entities[0].existence_probability
     world = world.update(measured(1.1, FRONT, answer=Unqueried("no frame")))
@@ -403,17 +396,10 @@ def test_not_looking_moves_nothing_but_survival():
     assert entity.visibility.answer == "unqueried"
 
 
-@given(st.floats(0.001, 0.999), st.floats(0.01, 0.99))
-def test_an_empty_look_is_bayes(r, miss_rate):
-    """Against the two-hypothesis table written out."""
-    empty = np.array([r * miss_rate, 1 - r])
-    assert after_empty_look(r, miss_rate) == pytest.approx(empty[0] / empty.sum())
-
-
 @given(st.floats(0.01, 0.99), st.floats(0.01, 0.5))
 @settings(max_examples=20, deadline=None)
-def test_a_first_box_is_believed_by_its_score_and_the_cameras_clutter(score, clutter):
-    """Birth against clutter, the score as odds; a second box at the place confirms, a missing one refutes."""
+def test_a_first_box_is_weighted_by_its_score_and_the_clutter(score, clutter):
+    """The odds are birth against clutter times the score; a second box raises them, a miss lowers them."""
     box = Sighting(0.1, 0.02, "car", score, 0.1)
     first = measured(1.0, FRONT, box, answer=Present(0.05, clutter))
     world = start(settings=FilterSettings(street=StreetModel(death=1e-9))).update(first)
@@ -456,7 +442,7 @@ def scripts(draw):
 
 @settings(max_examples=60, deadline=None)
 @given(scripts())
-def test_every_state_is_sound(script):
+def test_every_state_is_consistent(script):
     world = start()
     for measurement in script:
         world = world.update(measurement)
@@ -477,7 +463,7 @@ def test_every_state_is_sound(script):
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(approaches, min_size=5, max_size=30), st.floats(-1.5, 1.5))
-def test_a_hidden_entity_stays_on_its_side_whatever_looming_says(rates, azimuth):
+def test_a_hidden_entity_stays_on_its_side_for_any_looming(rates, azimuth):
     peak, times = Bearing(azimuth, 0.06), hops(1.0, 4.5)
     script = [measured(t, LEFT, approach=rate, bearing=peak) for t, rate in zip(times, rates, strict=False)]
     _, states = run(start(), script)
@@ -487,7 +473,7 @@ def test_a_hidden_entity_stays_on_its_side_whatever_looming_says(rates, azimuth)
 
 
 def described(state, sign):
-    """A state without ids, in a mirror if sign is -1."""
+    """Return a state without ids, mirrored if sign is -1."""
     side = {"left": "right", "right": "left"} if sign < 0 else {"left": "left", "right": "right"}
 
     def rounded(value):
@@ -525,7 +511,7 @@ def test_a_mirrored_world_has_the_mirrored_state():
 @settings(max_examples=40, deadline=None)
 @given(scripts())
 def test_any_mirrored_world_has_the_mirrored_state(script):
-    # A car dead ahead is as near to one side as to the other, and has to be given to one of them.
+    # A car straight ahead is equally near to both sides and is assigned to one of them.
     script = [m for m in script if all(abs(s.azimuth_rad) > 1e-3 for s in m.sightings)]
     _, states = run(start(), script)
     _, reflections = run(start(), [mirrored(m) for m in script])
@@ -536,33 +522,7 @@ def test_any_mirrored_world_has_the_mirrored_state(script):
                 assert a == pytest.approx(b, abs=1e-5)
 
 
-@settings(max_examples=30, deadline=None)
-@given(scripts(), st.randoms())
-def test_the_order_of_sightings_does_not_matter(script, random):
-    shuffled = [replace(m, sightings=tuple(random.sample(m.sightings, len(m.sightings)))) for m in script]
-    assert run(start(), shuffled)[1] == run(start(), script)[1]
-
-
-def test_predicting_in_small_steps_is_predicting_at_once():
-    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 3.0)])
-    small = world
-    for _ in range(10):
-        small = small.predict(0.05)
-    assert small.belief.hypotheses == pytest.approx(world.predict(0.5).belief.hypotheses)
-    assert small.state.stamp_ns == world.predict(0.5).state.stamp_ns == 3_400_000_000
-
-
-def test_update_predicts_by_itself():
-    script = list(approach_from_left())
-    _, states = run(start(), script)
-    world, explicit = start(), []
-    for measurement in script:
-        world = world.predict_to(measurement.stamp_ns).update(measurement)
-        explicit.append(world.state)
-    assert explicit == states
-
-
-def test_without_news_a_hidden_entity_fades_and_stays_on_its_side():
+def test_without_measurements_a_hidden_entity_fades_on_its_side():
     world, _ = run(start(), [measured(t, LEFT, approach=Approach(0.8, 0.2)) for t in hops(1.0, 4.0)])
     before = world.state.entities[0].existence_probability
     (entity,) = world.predict(3.0).state.entities
@@ -572,9 +532,9 @@ def test_without_news_a_hidden_entity_fades_and_stays_on_its_side():
 
 @given(st.floats(0.02, 0.49), st.floats(0.51, 0.98), st.sampled_from([Unqueried("-"), Absent(0.2)]))
 def test_risk_rises_with_the_posterior_and_is_the_map_of_the_statistic(low, high, answer):
-    """Of the first window the risk is the map of P(hidden): that of eq. (6), as long as nothing is looked at.
+    """The risk after the first window is the map of P(hidden), which is eq. (6) without a look.
 
-    A look is at what is in view beside a hidden vehicle as well, as usual here: every second time.
+    A look also counts against a visible vehicle beside a hidden one, here with probability 0.5.
     """
     policy = replace(POLICY, risk_map=PlattMap(-1.3, 0.4))
     certain = FilterSettings(street=StreetModel(works=1.0))  # The camera works
@@ -595,26 +555,10 @@ def test_risk_rises_with_the_posterior_and_is_the_map_of_the_statistic(low, high
     assert risks[0] < risks[1]
 
 
-@given(classes, st.integers(1, 20))
-def test_overlapping_windows_are_not_counted_twice(heard, number):
-    """Of windows that repeat what was heard nothing is new; multiplied, they weigh as their time."""
-    off, instant_ns = Unqueried("-"), 10**5  # So short that no vehicle moves meanwhile
-    still = FilterSettings(window_s=1e-4, windows="likelihood")
-
-    def believed(settings_, *stamps_ns):
-        script = [replace(measured(1.0, heard, answer=off), stamp_ns=10**9 + one) for one in stamps_ns]
-        return run(start(settings=settings_), script)[0].belief.hypotheses
-
-    overlapping = [hop * instant_ns // number for hop in range(number + 1)]
-    once, twice = believed(FilterSettings(), 0), believed(still, 0, instant_ns)
-    assert believed(FilterSettings(), *overlapping) == pytest.approx(once, abs=1e-3)
-    assert believed(still, *overlapping) == pytest.approx(twice, abs=1e-3)
-
-
 def test_overlapping_bearings_are_not_counted_twice():
-    """Ten tenths of a window weigh about as much as one window; of the azimuth a little more.
+    """Ten tenths of a window count about as one window, for the azimuth slightly more.
 
-    Whether the peak is the entity's own is asked anew each hop, which one window asks once.
+    Each hop associates the peak with the entity again; one window does this once.
     """
     loud = SignatureEvidence(("left", "right"), (12.0, 0.0), 0.0, 0.0)
     script = [replace(measured(t, LEFT), signature=loud) for t in hops(1.0, 4.0)]
@@ -645,16 +589,6 @@ def test_a_checkpoint_continues_bit_for_bit(script, cut):
     assert [s.to_json() for s in got] == [s.to_json() for s in expected]
 
 
-def test_a_damaged_checkpoint_is_refused():
-    world, _ = run(start(), [measured(t, LEFT) for t in hops(1.0, 3.0)])
-    value = json.loads(json.dumps(world.to_dict()))
-    with pytest.raises(SchemaVersionError):
-        WorldFilter.from_dict(value | {"schema": {"name": "worldstate.Filter", "version": "2.4.0"}})
-    value["memory"]["tracks"][0]["covariance"][0] = -1.0
-    with pytest.raises(InvalidArgumentError, match=r"tracks\[0\]\.covariance"):
-        WorldFilter.from_dict(value)
-
-
 def test_a_measurement_of_other_directions_is_refused_and_changes_nothing():
     world = start().update(measured(2.0, LEFT))
     before, other = world.state, SignatureEvidence(("north",), (0.0,), 0.0, 0.0)
@@ -663,14 +597,7 @@ def test_a_measurement_of_other_directions_is_refused_and_changes_nothing():
     assert world.state == before
 
 
-def test_time_does_not_run_back():
-    with pytest.raises(InvalidArgumentError, match="not before"):
-        start(start_ns=10**9).predict_to(0)
-    with pytest.raises(InvalidArgumentError, match="dt_s"):
-        start().predict(-0.1)
-
-
-def test_of_a_policy_for_other_directions_the_statistic_is_that_of_equal_priors():
+def test_a_policy_for_other_directions_uses_equal_priors():
     m = measured(1.0, LEFT)
     world = WorldFilter(policy=replace(POLICY, reference_prior=(0.25, 0.25, 0.5))).update(m)
     assert world.state.cues[0].statistic == pytest.approx(statistic(m.signature, m.co_evidence, (0.25,) * 4))
@@ -684,7 +611,7 @@ def test_the_same_run_has_the_same_ids():
 
 
 def test_an_uninformative_second_source_leaves_the_advisory_as_it_is():
-    """Thirty seconds of a radio that knows nothing, between the hops of a vehicle that is heard."""
+    """Empty evidence of a radio between the hops of an audible vehicle."""
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
     dumb = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     beside = [
@@ -696,10 +623,3 @@ def test_an_uninformative_second_source_leaves_the_advisory_as_it_is():
     heard = [state for state in both if state.stamp_ns in {one.stamp_ns for one in alone}]
     named, again = ([[bool(cue.advisory) for cue in state.cues] for state in run] for run in (alone, heard))
     assert again == named and [True, False] in named
-
-
-def test_without_news_an_advisory_ends_after_a_second():
-    world, states = run(start(), [measured(t, LEFT) for t in hops(1.0, 4.0)])
-    assert any(cue.advisory for cue in states[-1].cues)
-    assert any(cue.advisory for cue in world.predict(0.9).state.cues)
-    assert not any(cue.advisory for cue in world.predict(1.1).state.cues)

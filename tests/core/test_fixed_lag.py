@@ -1,4 +1,4 @@
-"""Late, repeated, reordered and misdated measurements: the belief is that of the measurements in order."""
+"""Late, repeated, reordered and misdated measurements give the belief of measurements in order."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,7 @@ SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
 def scan(rng: np.random.Generator, stamp_ns: int, searches: bool) -> PositionScan:
-    """Return what a radar finds ahead, or where vehicles say that they are."""
+    """Return a radar scan or messages with positions."""
     at = (Position((rng.uniform(5, 20), rng.uniform(-20, 20)), ((1.0, 0.2), (0.2, 0.5))) for _ in range(2))
     at = (replace(one, existence_probability=float(rng.uniform(0.1, 0.9))) for one in at)
     searched = SearchedSector(Sector(0.0, 1.0), 50.0, 0.8) if searches else None
@@ -29,7 +29,7 @@ def scan(rng: np.random.Generator, stamp_ns: int, searches: bool) -> PositionSca
 
 
 def script(rng: np.random.Generator, hops: int = 18) -> list[Timed]:
-    """Return sound every tenth of a second, a camera in it, and a radio and a radar now and then."""
+    """Return sound with a camera every 0.1 s, and sometimes a radio and a radar."""
     measured: list[Timed] = []
     for hop in range(1, hops + 1):
         left, right, visible, none = rng.normal(0.0, 1.0, 4).tolist()
@@ -60,7 +60,7 @@ def filtered(measurements: list[Timed], world: WorldFilter | None = None) -> Wor
 
 
 def content(world: WorldFilter) -> WorldState:
-    return replace(world.state, delivery=Delivery(), events=())  # Both follow from when it was delivered
+    return replace(world.state, delivery=Delivery(), events=())  # Both depend on the time of delivery
 
 
 def arrived_late(rng: np.random.Generator, told: list[Timed]) -> list[Timed]:
@@ -83,7 +83,7 @@ def test_the_order_of_arrival_does_not_matter_within_the_lag(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=5)
-def test_events_lead_from_one_snapshot_to_the_next_however_late_their_cause_comes(seed: int) -> None:
+def test_events_explain_changes_between_snapshots_with_late_data(seed: int) -> None:
     rng, world, counted = np.random.default_rng(seed), WorldFilter(), set()
     for one in arrived_late(rng, script(rng, 80)):
         before, world = world.state.entities, world.update(one)
@@ -104,8 +104,8 @@ def test_events_lead_from_one_snapshot_to_the_next_however_late_their_cause_come
 
 @given(SEEDS)
 @settings(max_examples=3)
-def test_no_time_is_special(seed: int) -> None:
-    """Neither one before zero nor zero itself: a message places vehicles that a camera misses for certain."""
+def test_stamps_of_zero_and_below_are_ordinary(seed: int) -> None:
+    """Stamps before zero and at zero behave like others; the camera never misses a vehicle."""
     rng = np.random.default_rng(seed)
     sure, told = Absent(0.0, 0.01), []
     for one in script(rng):
@@ -127,7 +127,7 @@ def test_no_time_is_special(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=3)
-def test_what_was_delivered_before_changes_nothing(seed: int) -> None:
+def test_a_repeated_delivery_changes_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     once = script(rng)
     often = [copy for one in once for copy in [one] * int(rng.integers(1, 4))]
@@ -138,7 +138,7 @@ def test_what_was_delivered_before_changes_nothing(seed: int) -> None:
 
 @given(SEEDS, st.integers(1, 12))
 @settings(max_examples=3)
-def test_a_checkpoint_takes_late_measurements_as_the_filter_itself_does(seed: int, cut: int) -> None:
+def test_a_checkpoint_accepts_late_measurements_as_the_filter_does(seed: int, cut: int) -> None:
     in_order = script(np.random.default_rng(seed))
     late = in_order.pop(cut)
     until = [one for one in in_order if one.stamp_ns <= late.stamp_ns + 15 * 10**8]
@@ -149,17 +149,17 @@ def test_a_checkpoint_takes_late_measurements_as_the_filter_itself_does(seed: in
     assert filtered(rest, world).state.delivery.replayed == 1
 
 
-def test_beyond_the_lag_it_is_counted_and_left_out() -> None:
+def test_a_measurement_beyond_the_lag_is_counted_and_ignored() -> None:
     in_order = script(np.random.default_rng(1), hops=40)
     world = filtered(in_order[1:])
     late = world.update(in_order[0])
     assert late.state == replace(world.state, delivery=Delivery(too_late=1))
-    # A single stray one is no change of clocks, however old it is.
+    # A single stray stamp is no clock change, however old it is.
     again = filtered([in_order[0], *script(np.random.default_rng(2), hops=50)[-10:]], late)
     assert again.state.delivery.reanchored == 0
 
 
-def test_after_a_clock_was_set_back_it_goes_on_within_two_seconds() -> None:
+def test_the_filter_continues_two_seconds_after_a_clock_is_set_back() -> None:
     hour_ns = 3600 * 10**9
     before = [replace(one, stamp_ns=one.stamp_ns + hour_ns) for one in script(np.random.default_rng(1))]
     after = script(np.random.default_rng(2), hops=30)
@@ -185,7 +185,7 @@ def test_one_stray_stamp_changes_nothing_after_it(
         stricken = stricken.update(one)
     assert stricken.state.delivery == Delivery(held_back=1, repeated=int(again))
     for one in in_order[at:]:
-        if clocked:  # By a caller that predicts to the time of each
+        if clocked:  # The caller predicts to the time of each measurement
             straight, stricken = straight.predict_to(one.stamp_ns), stricken.predict_to(one.stamp_ns)
         straight, stricken = straight.update(one), stricken.update(one)
         assert content(stricken) == content(straight)
@@ -193,26 +193,26 @@ def test_one_stray_stamp_changes_nothing_after_it(
 
 @given(SEEDS, st.floats(2.2, 1e9), st.booleans())
 @settings(max_examples=5)
-def test_two_that_agree_are_ahead_together(seed: int, pause_s: float, other: bool) -> None:
-    """After a pause, or a clock that was set on: by the next one of its own, or one of another source."""
+def test_two_agreeing_stamps_confirm_a_clock_step(seed: int, pause_s: float, other: bool) -> None:
+    """After a pause or a clock step, the next measurement of any source confirms the new time."""
     *before, one = script(np.random.default_rng(seed))
     ahead_ns = one.stamp_ns + round(pause_s * 1e9)
     after = [replace(one, source="another") if other else one, one]
     after = [replace(it, stamp_ns=ahead_ns + k * 10**8) for k, it in enumerate(after)]
     world = filtered(before)
     assert content(world.update(after[0])) == content(world)
-    # Predicted to that time it is ahead of nothing.
+    # After a prediction to that time it is not ahead.
     expected = filtered(after, world.predict_to(after[0].stamp_ns))
     both = filtered(after, world)
     assert content(both) == content(expected) and both.state.delivery == world.state.delivery
-    # Predicted there by a caller with a clock of its own: the first one is not lost.
+    # If the caller predicts to that time in between, the first measurement is not lost.
     clocked = world.update(after[0]).predict_to(after[1].stamp_ns).update(after[1])
     assert content(clocked) == content(expected) and clocked.state.delivery == world.state.delivery
     copy = WorldFilter.from_dict(json.loads(json.dumps(world.update(after[0]).to_dict())))
     assert copy.update(after[1]).state == both.state
 
 
-def test_a_slow_stream_goes_on_at_its_own_pace() -> None:
+def test_a_slow_stream_keeps_its_pace() -> None:
     one, world = script(np.random.default_rng(3))[0], WorldFilter()
     reached_s = list[int]()
     for number in range(1, 7):

@@ -1,4 +1,4 @@
-"""The joint belief of all sides: its laws over random inputs, against enumeration and gtsam."""
+"""The joint belief of all sides: laws over random inputs, against enumeration and gtsam."""
 
 import itertools
 from dataclasses import replace
@@ -27,7 +27,7 @@ from worldstate.ground import FloatArray
 
 SEEDS = st.integers(0, 2**32 - 1)
 STREET = StreetModel()
-ALONE = StreetModel(follows=1e-12)  # None comes right behind another one
+ALONE = StreetModel(follows=1e-12)  # No vehicle follows directly behind another
 CERTAIN = replace(STREET, works=1.0)  # The camera works
 COMING = len(COMING_S)
 
@@ -64,7 +64,7 @@ def every_state(sides: int) -> list[tuple[int, ...]]:
 @pytest.mark.parametrize("sides", [1, 2])
 @given(SEEDS)
 @settings(max_examples=3, deadline=None)
-def test_it_is_what_enumeration_of_all_states_finds(sides: int, seed: int) -> None:
+def test_the_belief_equals_enumeration_of_all_states(sides: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior = prior_of(rng, sides)
     belief, by_hand = JointBelief(prior.weights), prior.weights
@@ -105,7 +105,7 @@ def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=1, deadline=None)
-def test_it_is_what_a_factor_graph_infers(seed: int) -> None:
+def test_the_belief_equals_a_factor_graph(seed: int) -> None:
     """Oracle: gtsam's discrete factor graph of two sides over three steps, eliminated."""
     rng = np.random.default_rng(seed)
     prior, told = prior_of(rng, 2), [likelihoods(rng, 2) for _ in range(2)]
@@ -134,10 +134,10 @@ def test_it_is_what_a_factor_graph_infers(seed: int) -> None:
 
 
 @given(SEEDS, st.sampled_from([1, 2]))
-def test_one_far_off_is_one_vehicle_on_whichever_sides_it_sounds(seed: int, sides: int) -> None:
-    """Counted on each side, it made a vehicle of nothing; and what is in view is not far off as well.
+def test_a_distant_vehicle_on_several_sides_counts_once(seed: int, sides: int) -> None:
+    """Counted per side, a distant vehicle made an existing one from nothing.
 
-    Of streets in which none comes the explanations are the reading's own groups.
+    If no vehicle comes, the hypotheses are the groups of the reading.
     """
     rng = np.random.default_rng(seed)
     seen, far = 0.5 * rng.random(), 0.5 * rng.random(sides)
@@ -155,14 +155,16 @@ def test_one_far_off_is_one_vehicle_on_whichever_sides_it_sounds(seed: int, side
 
 @given(SEEDS)
 @settings(max_examples=5, deadline=None)
-def test_alone_a_reading_is_believed_as_it_is_whatever_was_believed_before(seed: int) -> None:
-    """With all of what is new believed at once, at 1e-9, and each side has its own chances to come."""
+def test_a_reading_alone_replaces_the_belief(seed: int) -> None:
+    """The reading takes full effect, to 1e-9, and each side has its own probabilities."""
     rng = np.random.default_rng(seed)
     prior = prior_of(rng, 2)
     belief = JointBelief(prior.weights)
     for step_ns in rng.integers(5 * 10**7, 2 * 10**9, 5).tolist():
         groups = groups_of(rng, 2)
-        groups[:, GROUPS.index("none")] += 1.0  # Else a vehicle is surer than two sides together allow
+        groups[:, GROUPS.index("none")] += (
+            1.0  # Otherwise the probabilities of both sides would be inconsistent
+        )
         groups /= groups.sum(axis=1, keepdims=True)
         reading = joint_reading(groups, 0.2, STREET.by_sound)
         belief = belief.carried(prior, STREET, step_ns).read("ear", reading, prior, (0, 1))
@@ -172,8 +174,8 @@ def test_alone_a_reading_is_believed_as_it_is_whatever_was_believed_before(seed:
 
 @given(SEEDS)
 @settings(max_examples=3, deadline=None)
-def test_with_readings_of_the_same_chain_it_is_the_exact_filter_of_everything(seed: int) -> None:
-    """A reading is the posterior of the sound alone; what else is told keeps its worth."""
+def test_readings_of_the_same_chain_give_the_exact_filter(seed: int) -> None:
+    """A reading is the posterior of the sound alone; other evidence keeps its full effect."""
     rng = np.random.default_rng(seed)
     prior = prior_of(rng, 2)
     belief = sound = exact = JointBelief(prior.weights)
@@ -202,10 +204,10 @@ def test_mirrored_evidence_gives_the_mirrored_belief(seed: int) -> None:
 
 
 def read_often(looks_ns: list[int], street: StreetModel, miss: float = 0.05) -> JointBelief:
-    """Return the belief after a constant reading, in view 0.8 and coming 0.15, and empty looks."""
+    """Return the belief after empty looks and a constant reading: visible 0.8, coming 0.15."""
     groups = np.full((1, len(GROUPS)), 1e-9)
     groups[0, [GROUPS.index("seen"), GROUPS.index("coming_2s"), GROUPS.index("none")]] = 0.8, 0.15, 0.05
-    # One side alone: in view 0.8, coming 0.15 with nothing in view, so that they exclude each other.
+    # There is one side; visible and coming exclude each other.
     reading = np.zeros((PARTS, 2))
     reading[NONE], reading[FIRST_BIN + 3, 0] = (0.05, 0.8), 0.15
     reading = np.maximum(reading, 1e-12) / reading.sum()
@@ -218,8 +220,8 @@ def read_often(looks_ns: list[int], street: StreetModel, miss: float = 0.05) -> 
 
 @given(st.integers(1, 6), st.floats(0.01, 0.6))
 @settings(max_examples=20, deadline=None)
-def test_empty_looks_a_correlation_time_apart_count_one_by_one(count: int, miss: float) -> None:
-    """Law 15, while the camera works: the odds of in view are those of eq. (6) with beta to the n."""
+def test_empty_looks_a_correlation_time_apart_count_in_full(count: int, miss: float) -> None:
+    """Law 15 with a working camera: the odds of a visible vehicle are eq. (6) with beta^n."""
     belief = read_often([k * 3 * 10**8 for k in range(count)], CERTAIN, miss)
     assert belief.in_view / (1.0 - belief.in_view) == pytest.approx(4.0 * miss**count, rel=1e-6)
 
@@ -232,14 +234,14 @@ def test_looks_within_one_correlation_time_count_as_one(count: int, miss: float)
     assert many.in_view == pytest.approx(one.in_view, rel=1e-9)
 
 
-def test_a_second_of_empty_looks_denies_what_sounds_in_view() -> None:
+def test_a_second_of_empty_looks_excludes_a_visible_vehicle() -> None:
     after = read_often([k * 10**8 for k in range(10)], CERTAIN)
     assert 0.0001 <= after.in_view <= 0.0004
     within = read_often([k * 10**7 for k in range(10)], CERTAIN)
     assert within.in_view == pytest.approx(0.8 * 0.05 / (0.8 * 0.05 + 0.2), rel=1e-6)
 
 
-def test_empty_looks_saturate_at_the_chance_that_the_camera_is_dead() -> None:
+def test_empty_looks_saturate_at_the_probability_of_a_dead_camera() -> None:
     last = read_often([k * 3 * 10**8 for k in range(200)], STREET)
     assert last.in_view / (1.0 - last.in_view) == pytest.approx(4.0 * (1.0 - STREET.works), rel=0.05)
     works = last.trust["camera"].works
@@ -248,13 +250,13 @@ def test_empty_looks_saturate_at_the_chance_that_the_camera_is_dead() -> None:
 
 @given(SEEDS)
 @settings(max_examples=5, deadline=None)
-def test_a_vehicle_of_unknown_side_is_gone_from_the_other_side_and_a_second_one_is_not(seed: int) -> None:
+def test_a_hand_over_removes_an_unknown_side_but_not_a_second_vehicle(seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior = prior_of(rng, 2)
     one, two = np.full((PARTS, PARTS, 2), 1e-6), np.full((PARTS, PARTS, 2), 1e-6)
     one[FIRST_BIN, NONE, 0] = one[NONE, FIRST_BIN, 0] = 0.5
     two[FIRST_BIN, FIRST_BIN + 1, 0] = 1.0
-    # As seldom as a vehicle comes that was not due.
+    # The remaining probability is that of an unheard vehicle.
     for reading, left in ((one, 1.2 * STREET.unheard), (two, 0.95)):
         before = JointBelief(prior.weights).read("ear", reading / reading.sum(), prior, (0, 1))
         after = before.emerged(0, 0.02, False, ALONE)
@@ -267,14 +269,12 @@ def test_a_vehicle_of_unknown_side_is_gone_from_the_other_side_and_a_second_one_
 @pytest.mark.parametrize("sides", [2, 3])
 @given(st.integers(0, COMING - 1))
 @settings(max_examples=9, deadline=None)
-def test_one_seen_on_another_side_than_it_was_heard_on_is_two_as_seldom_as_one_comes_unheard(
-    sides: int, bin_: int
-) -> None:
-    """Heard on side 1, seen on side 0: it is still hidden with the odds (1 - c) p_u to c."""
+def test_a_sighting_on_the_other_side_is_rarely_a_second_vehicle(sides: int, bin_: int) -> None:
+    """Evidence of side 1 and a sighting on side 0 leave a hidden vehicle with odds (1 - c) p_u to c."""
     weights = np.zeros((*[STATES] * sides, 2))
     weights[(2 * NONE, 2 * (FIRST_BIN + bin_), *[2 * NONE] * (sides - 2), 0)] = 1.0
     after = JointBelief(weights).emerged(0, 0.0, False, ALONE)
-    confused = STREET.side_confusion / (sides - 1)  # One of the other sides
+    confused = STREET.side_confusion / (sides - 1)  # Confused with one of the other sides
     two = (1.0 - confused) * STREET.unheard
     assert after.hidden[1, FIRST_BIN:].sum() == pytest.approx(two / (confused + two))
     assert after.emerged_from[0] == pytest.approx(1.0)

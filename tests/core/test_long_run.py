@@ -1,4 +1,4 @@
-"""A long day of a street: memory stays flat, and the checkpoint of every hour goes on to the same state."""
+"""A day of a street: constant memory, and checkpoints that continue to the same state."""
 
 import json
 from collections.abc import Iterator
@@ -16,12 +16,12 @@ from worldstate.measurement import Bearing, Look, Position, PositionScan
 HOP_NS, HOPS_PER_HOUR = 10**8, 36_000
 SHARE = np.array([0.004] * len(COMING_S) + [0.05, 0.05, 0.05, 0.05, 0.05, 0.714])
 SILENT = NotUsable("nothing to be heard")
-# A vehicle comes out of either side every twenty seconds or so, is heard for five seconds and seen for three.
+# Each side has a vehicle about every 20 s, audible for 5 s and visible for 3 s.
 HEARD_S, SEEN_S, APART_S = 5.0, 3.0, 20.0
 
 
 def reading(rng: np.random.Generator, times_s: list[float | None]) -> SequenceReading:
-    """Return what a sequence says of two sides, of each of which somebody comes in so many seconds or not."""
+    """Return a reading of two sides with the time to visible of each, if any."""
     groups = np.tile(SHARE, (2, 1))
     for side, time_s in enumerate(times_s):
         if time_s is not None:
@@ -32,7 +32,7 @@ def reading(rng: np.random.Generator, times_s: list[float | None]) -> SequenceRe
 
 
 def street(rng: np.random.Generator, hops: int) -> Iterator[Measurement | PositionScan]:
-    """Yield ten hops a second of sound and camera and one radar scan a second, drawn on the way."""
+    """Yield ten hops of sound and camera per second and one radar scan per second."""
     entry_s = rng.exponential(APART_S, 2) + HEARD_S
     for hop in range(1, hops + 1):
         now_s, stamp_ns = hop / 10, hop * HOP_NS
@@ -90,7 +90,7 @@ def drive(hours: float, checkpoints: int) -> tuple[list[int], list[int]]:
     return pages, sizes
 
 
-def test_a_checkpoint_goes_on_to_the_same_state_and_does_not_grow() -> None:
+def test_a_checkpoint_continues_to_the_same_state_and_does_not_grow() -> None:
     _, sizes = drive(0.01, 3)
     assert max(sizes) < 2 * min(sizes)
 

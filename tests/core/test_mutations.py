@@ -1,4 +1,4 @@
-"""The list of mutations fits the library, and the suite of the core notices nine in ten of them."""
+"""The list of mutations fits the library, and the tests of the core detect 90 % of them."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from run_mutations import AREAS, MUTATIONS
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_every_mutation_stands_once_in_its_file() -> None:
+def test_the_old_text_of_every_mutation_occurs_once() -> None:
     wrong = [one.name for one in MUTATIONS if (ROOT / one.file).read_text().count(one.old) != 1]
     wrong += [one.name for one in MUTATIONS if one.old == one.new or not _exists(one.test)]
     assert wrong == []
@@ -35,7 +35,7 @@ def test_every_field_of_a_snapshot_is_a_quantity_or_constant() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("held", [(), ("--freeze",)])
-def test_nine_in_ten_mutations_and_every_quantity_that_is_held_are_noticed(held: tuple[str, ...]) -> None:
+def test_90_per_cent_of_mutations_and_all_frozen_quantities_are_detected(held: tuple[str, ...]) -> None:
     program = [sys.executable, str(ROOT / "tests/core/run_mutations.py"), *held]
     done = subprocess.run(program, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]

@@ -1,4 +1,4 @@
-"""Everything that a snapshot states is a marginal of one belief: laws over random inputs."""
+"""All values of a snapshot are marginals of one belief: laws over random inputs."""
 
 import math
 from dataclasses import replace
@@ -50,7 +50,7 @@ def hop(rng: np.random.Generator, number: int, *, sequence: bool) -> Measurement
 
 
 def scan(rng: np.random.Generator, number: int) -> PositionScan:
-    """Return a message that places a vehicle behind the left or the right corner, or in view."""
+    """Return a message with a vehicle behind the left or right corner, or in view."""
     side = rng.choice([-1.0, 0.0, 1.0])
     place = (10.0, 30.0 * side - 0.8 * side * number)
     car = Position(
@@ -64,7 +64,7 @@ def states(seed: int, *, sequence: bool, hops: int = 25) -> list[WorldState]:
     world = WorldFilter(policy=replace(uncalibrated_policy(), risk_map=PlattMap(-1.7, 0.3)))
     found = []
     for number in range(1, hops):
-        if number == 12 and rng.random() < 0.5:  # Nothing is measured for a while
+        if number == 12 and rng.random() < 0.5:  # A pause without measurements
             found.append(world.predict(float(rng.uniform(0.5, 3.0))).state)
         if rng.random() < 0.3:
             world = world.update(scan(rng, number))
@@ -76,7 +76,7 @@ def states(seed: int, *, sequence: bool, hops: int = 25) -> list[WorldState]:
 @pytest.mark.parametrize("sequence", [False, True])
 @given(SEEDS)
 @settings(max_examples=8, deadline=None)
-def test_every_snapshot_holds_to_the_laws(sequence: bool, seed: int) -> None:
+def test_every_snapshot_obeys_the_laws(sequence: bool, seed: int) -> None:
     before = None
     for state in states(seed, sequence=sequence):
         assert broken_laws(state, before) == []
@@ -86,14 +86,14 @@ def test_every_snapshot_holds_to_the_laws(sequence: bool, seed: int) -> None:
 @given(SEEDS)
 @settings(max_examples=6, deadline=None)
 def test_an_alarm_depends_on_time_not_on_how_many_measurements_carry_it(seed: int) -> None:
-    """Empty messages, odometry, a source without evidence and a camera that misses all, at hops and between.
+    """Add empty messages, odometry, a source without evidence and a blind camera at and between hops.
 
-    The looks of that camera enter the mean that decides: of each hop the last one counts.
+    The looks of that camera enter the mean that decides; the last one of each hop counts.
     """
     rng, flat = np.random.default_rng(seed), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
-    # The traffic that is seen, which a camera that looks counts, moves no prior that is given.
+    # A given prior is not changed by the observed traffic.
     alone = crowded = WorldFilter(Context(priors=Priors(0.2, 0.3, 0.5)))
-    near_ns = [0, 0]  # When what decides was last so near to the threshold that dynamics may cross it
+    near_ns = [0, 0]  # Last time near enough to the threshold that the dynamics may cross it
     for number in range(1, 30):
         said = replace(hop(rng, number, sequence=True), sightings=())
         alone, crowded = alone.update(said), crowded.update(said)
@@ -111,8 +111,8 @@ def test_an_alarm_depends_on_time_not_on_how_many_measurements_carry_it(seed: in
             crowded = crowded.update(extra[rng.integers(4)])
 
 
-def test_what_a_risk_has_denied_does_not_decide_once_time_has_lifted_the_risk() -> None:
-    """A threshold below the usual log-odds: what is heard is above it and beside a risk below .1."""
+def test_a_denied_alarm_stays_denied_when_the_risk_rises_with_time() -> None:
+    """The threshold is below the usual log-odds, so the evidence exceeds it while the risk is below 0.1."""
     groups = np.full((2, len(GROUPS)), 1e-4)
     groups[:, :COMING], groups[:, -1] = 0.06 / COMING, 0.0
     groups[:, -1] = 1.0 - groups.sum(axis=1)
@@ -127,8 +127,8 @@ def test_what_a_risk_has_denied_does_not_decide_once_time_has_lifted_the_risk() 
 
 
 @pytest.mark.parametrize("nats", [7.0, 9.0])
-def test_the_alarm_by_windows_goes_by_time_however_often_they_come(nats: float) -> None:
-    """Two seconds of an empty street, then a vehicle: of windows that overlap, what is new counts."""
+def test_the_window_alarm_does_not_depend_on_the_window_rate(nats: float) -> None:
+    """After two empty seconds a vehicle comes; only the new part of overlapping windows counts."""
     empty, loud = (SignatureEvidence(("left", "right"), (one, -nats), 0.0, 0.0) for one in (-nats, nats))
     onsets_s = list[float]()
     for rate_hz in (5, 10, 20, 40, 100):
@@ -144,7 +144,7 @@ def test_the_alarm_by_windows_goes_by_time_however_often_they_come(nats: float) 
 
 
 def both_sides(coming: tuple[float, float], other: tuple[float, float], bin_: str) -> SequenceReading:
-    """Return a reading of how likely one comes on each side, and only on the other one."""
+    """Return a reading with P(coming) of each side and P(coming on the other side only)."""
     groups = np.full((2, len(GROUPS)), 1e-4)
     groups[:, GROUPS.index(bin_)] = coming
     groups[:, GROUPS.index("other")] = other
@@ -172,7 +172,7 @@ def cue_of(state: WorldState, side: str):
     return next(cue for cue in state.cues if cue.direction == side)
 
 
-def test_one_vehicle_of_unknown_side_is_gone_from_the_other_side_when_it_is_seen() -> None:
+def test_a_sighting_removes_a_vehicle_of_unknown_side_from_the_other_side() -> None:
     before, after = seen_from_left(both_sides((0.55, 0.42), (0.42, 0.55), "coming_1s"))
     assert cue_of(before, "right").risk > 0.3
     assert cue_of(after, "right").risk < 0.2
@@ -180,7 +180,7 @@ def test_one_vehicle_of_unknown_side_is_gone_from_the_other_side_when_it_is_seen
 
 
 def heard_as(*said: SequenceReading, hops: int = 6) -> list[WorldState]:
-    """Return the states of some readings, each for a while, with nothing seen."""
+    """Return the states of some readings, each for some hops, without looks."""
     world, quiet, states = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0), []
     for number in range(hops * len(said)):
         reading_ = said[number // hops]
@@ -196,15 +196,15 @@ OTHER_WAY = both_sides((0.42, 0.55), (0.55, 0.42), "coming_2s")
 TWO = both_sides((0.9, 0.95), (0.08, 0.03), "coming_2s")
 
 
-def test_one_vehicle_of_unknown_side_is_one_entity_with_a_share_on_each_side() -> None:
+def test_a_vehicle_of_unknown_side_is_one_entity_with_shares() -> None:
     state = heard_as(ONE)[-1]
     (entity,) = state.entities
     shares = {one.direction: one.probability for one in entity.sides}
     risks = {cue.direction: cue.risk for cue in state.cues}
     assert sum(shares.values()) == pytest.approx(1.0)
-    # But for one of it that is in view already.
+    # The difference is the probability that it is already visible.
     assert shares["left"] / shares["right"] == pytest.approx(risks["left"] / risks["right"], rel=0.02)
-    assert abs(entity.existence_probability - sum(risks.values())) < 0.03  # Both come as rarely
+    assert abs(entity.existence_probability - sum(risks.values())) < 0.03  # P(both) is small
     assert entity.direction == "left" and {cue.entity_id for cue in state.cues} == {entity.id}
     for one in entity.sides:
         assert one.azimuth_rad == pytest.approx(cue_of(state, one.direction).azimuth_rad)
@@ -216,17 +216,17 @@ def test_one_vehicle_of_unknown_side_is_one_entity_with_a_share_on_each_side() -
     assert WorldState.from_json(state.to_json()) == state
 
 
-def test_a_vehicle_heard_likelier_on_the_other_side_keeps_its_id() -> None:
+def test_an_entity_that_changes_its_likelier_side_keeps_its_id() -> None:
     *_, before = heard_as(ONE)
     *_, after = heard_as(ONE, OTHER_WAY)
     assert [one.id for one in after.entities] == [one.id for one in before.entities]
     assert [one.direction for one in (*before.entities, *after.entities)] == ["left", "right"]
 
 
-def test_two_are_two_when_both_are_likely_and_one_again_by_the_joint() -> None:
+def test_entities_split_and_merge_with_the_joint_belief() -> None:
     states = heard_as(OTHER_WAY, TWO, ONE)
     one, two, last = (states[hop].entities for hop in (5, 11, 17))
-    # The id goes on at the side that was likelier when it became two.
+    # The id stays on the side that was likelier at the split.
     assert {entity.direction: entity.id == one[0].id for entity in two} == {"left": False, "right": True}
     assert all(not entity.sides for entity in two)
     assert [entity.id for entity in last] == [one[0].id] and len(last[0].sides) == 2
@@ -234,16 +234,16 @@ def test_two_are_two_when_both_are_likely_and_one_again_by_the_joint() -> None:
     assert merged.into == one[0].id
 
 
-def test_one_that_changes_sides_as_it_becomes_two_leaves_the_other_side_to_the_other() -> None:
-    """Likelier left so far, it is the one on the right: on the left another one is born, and no third."""
+def test_a_split_with_a_change_of_side_makes_two_entities() -> None:
+    """The entity, likelier on the left before, becomes the right one; one new entity is born on the left."""
     states = heard_as(ONE, TWO)
     (one,), two = (states[hop].entities for hop in (5, 11))
     assert {entity.direction: entity.id == one.id for entity in two} == {"left": False, "right": True}
     assert len(two) == 2
 
 
-def test_of_two_vehicles_the_one_that_is_still_heard_goes_on_under_its_own_id() -> None:
-    """Next to nothing is left on one side: the vehicle there is gone, or was part of the other one."""
+def test_the_remaining_of_two_entities_keeps_its_id() -> None:
+    """Almost no evidence is left on one side, so its entity dies or is merged."""
     states = heard_as(TWO, both_sides((0.9, 0.02), (0.02, 0.9), "coming_2s"))
     before = {one.direction: one.id for one in states[5].entities}
     assert set(before) == {"left", "right"}
@@ -254,7 +254,7 @@ def test_of_two_vehicles_the_one_that_is_still_heard_goes_on_under_its_own_id() 
 
 
 @pytest.mark.parametrize("edge_rad", [0.53, -0.53])
-def test_one_of_unknown_side_is_handed_over_where_it_is_seen(edge_rad: float) -> None:
+def test_an_entity_of_unknown_side_is_handed_over_at_either_edge(edge_rad: float) -> None:
     world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     near = both_sides((0.55, 0.42), (0.42, 0.55), "coming_0.5s")
     for number in range(1, 9):
@@ -273,13 +273,13 @@ def test_one_of_unknown_side_is_handed_over_where_it_is_seen(edge_rad: float) ->
     assert (hidden.azimuth_source, car.azimuth_source) == ("context", "measured")
 
 
-def test_a_second_vehicle_believed_apart_stays_when_the_first_is_seen() -> None:
+def test_a_second_hidden_vehicle_stays_when_the_first_is_seen() -> None:
     before, after = seen_from_left(both_sides((0.9, 0.85), (0.04, 0.08), "coming_1s"))
     assert cue_of(after, "right").risk > 0.95 * cue_of(before, "right").risk
 
 
-def test_a_second_vehicle_believed_apart_is_not_unheard_because_the_first_masks_it() -> None:
-    """Law 11: while the window holds the sound of the first one, no reading or look counts against it."""
+def test_a_masked_second_vehicle_keeps_its_existence() -> None:
+    """Law 11: while the first vehicle masks the sound, no reading or look lowers the second."""
     world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     masked = np.full((2, len(GROUPS)), 1e-3)
     masked[:, GROUPS.index("seen")] = 1.0
@@ -295,20 +295,20 @@ def test_a_second_vehicle_believed_apart_is_not_unheard_because_the_first_masks_
     right = {one.direction: one for one in before.entities}["right"]
     now = {one.id: one for one in world.state.entities if one.status == "hidden"}[right.id]
     assert now.existence_probability > 0.95 * right.existence_probability
-    assert now.direction == "right"  # What is in view on the left is the other one
-    # It was believed to come within two seconds: a part of it may have come by now.
+    assert now.direction == "right"  # The visible vehicle on the left is the other one
+    # It was due within two seconds, so it may already be visible.
     assert cue_of(world.state, "right").risk > 0.8 * cue_of(before, "right").risk
 
 
-def test_the_advisory_ends_with_the_hand_over_and_the_side_begins_with_those_that_follow() -> None:
+def test_the_advisory_ends_with_the_hand_over() -> None:
     before, after = seen_from_left(both_sides((0.97, 0.01), (0.01, 0.97), "coming_0.5s"))
     assert [event.kind for event in after.events] == ["handed_over"]
     assert cue_of(before, "left").advisory is not None and cue_of(after, "left").advisory is None
-    # As many as follow have another one behind them.
+    # The risk is the share of vehicles that are followed by another.
     assert cue_of(after, "left").risk == pytest.approx(StreetModel().follows, abs=0.03)
 
 
-def test_an_advisory_and_what_decided_end_with_the_news_and_with_the_vehicle_wherever_it_comes_from() -> None:
+def test_an_advisory_ends_without_measurements_and_with_any_hand_over() -> None:
     world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     far, near = (both_sides((0.8, 0.15), (0.15, 0.8), bin_) for bin_ in ("coming_3s", "coming_0.5s"))
     for number in range(1, 20):
@@ -328,7 +328,7 @@ def test_an_advisory_and_what_decided_end_with_the_news_and_with_the_vehicle_whe
     assert broken_laws(after, world.state) == [] and cue_of(after, "left").advisory is None
 
 
-def test_high_risk_without_advisory_says_why() -> None:
+def test_a_high_risk_without_an_advisory_has_its_reason() -> None:
     far = both_sides((0.9, 0.02), (0.02, 0.9), "coming_8s")
     world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     for number in range(1, 6):
@@ -340,8 +340,8 @@ def test_high_risk_without_advisory_says_why() -> None:
 
 @given(SEEDS, st.integers(1, 30))
 @settings(max_examples=8, deadline=None)
-def test_an_array_that_never_hears_leaves_the_risk_of_the_prior(seed: int, hops: int) -> None:
-    """Whatever its samples hold, and whatever the policy's map makes of a quiet window."""
+def test_unusable_sound_leaves_the_prior_risk(seed: int, hops: int) -> None:
+    """The samples and the risk map of the policy have no effect."""
     rng, policy = np.random.default_rng(seed), replace(uncalibrated_policy(), risk_map=PlattMap(-3.0, 2.0))
     world = first = WorldFilter(policy=policy)
     for number in range(1, hops + 1):
@@ -355,7 +355,7 @@ def test_an_array_that_never_hears_leaves_the_risk_of_the_prior(seed: int, hops:
 @pytest.mark.parametrize("sequence", [False, True])
 @given(SEEDS)
 @settings(max_examples=5, deadline=None)
-def test_a_hop_that_could_not_be_heard_moves_nothing_but_what_time_moves(sequence: bool, seed: int) -> None:
+def test_an_unusable_hop_equals_a_prediction(sequence: bool, seed: int) -> None:
     rng, world = np.random.default_rng(seed), WorldFilter()
     deaf = Measurement(
         1_500_000_000, SignatureEvidence(("left", "right"), tuple(rng.uniform(-3, 3, 2)), 0.0, 0.0),
@@ -369,13 +369,13 @@ def test_a_hop_that_could_not_be_heard_moves_nothing_but_what_time_moves(sequenc
             {(entity.id, entity.status) for entity in one.state.entities}
             for one in (world.update(replace(deaf, stamp_ns=at_ns)), world.predict_to(at_ns))
         )
-        assert heard <= moved  # None is born, nor hidden again but by its own motion
+        assert heard <= moved  # No births, and no change of status except by motion
     after, carried = world.update(deaf).state, world.predict_to(1_500_000_000).state
     for told, alone in zip(after.cues, carried.cues, strict=True):
         assert told.risk == pytest.approx(alone.risk, abs=1e-12)
         assert (told.within or {}) == pytest.approx(alone.within or {}, abs=1e-12)
         assert told.hypotheses.hidden == pytest.approx(alone.hypotheses.hidden, abs=1e-12)
-        # It is no news either: an alarm ends as in silence.
+        # It does not extend an alarm either.
         ends_ns = [one.advisory and one.advisory.valid_until_ns for one in (told, alone)]
         assert ends_ns[0] == ends_ns[1]
     assert after.heard is not None and not after.calibrated
@@ -387,10 +387,8 @@ def test_a_hop_that_could_not_be_heard_moves_nothing_but_what_time_moves(sequenc
 @pytest.mark.parametrize("sequence", [False, True])
 @pytest.mark.parametrize("lost_s", [3.0, 10.0])
 @pytest.mark.parametrize("blocks", ["zeros", "missing"])
-def test_without_sound_a_vehicle_stands_with_the_existence_its_dynamics_give(
-    sequence: bool, lost_s: float, blocks: str
-) -> None:
-    """Until the ear works again; the hops of before then stand alone, and say nothing of times yet."""
+def test_without_sound_the_belief_follows_its_dynamics(sequence: bool, lost_s: float, blocks: str) -> None:
+    """Existence, risk and azimuth follow the dynamics until sound is usable again."""
     rng, said = np.random.default_rng(1), both_sides((0.97, 0.01), (0.01, 0.97), "coming_8s")
     world, loud = WorldFilter(), SignatureEvidence(("left", "right"), (3.0, 0.0), 0.0, 0.0)
     for number in range(1, 21):
@@ -404,7 +402,7 @@ def test_without_sound_a_vehicle_stands_with_the_existence_its_dynamics_give(
             number * 10**8, loud, Unqueried("-"), SILENT, SILENT, heard=deaf,
             sequence=lost if blocks == "zeros" or not sequence else TOO_FEW,
         )  # fmt: skip
-        world = world.predict_to(one.stamp_ns).update(one)  # As a listener does
+        world = world.predict_to(one.stamp_ns).update(one)  # In the order of a listener
     state, carried = world.state, before.predict_to(world.stamp_ns).state
     (now,), (then,) = state.entities, carried.entities
     assert now.id == then.id and now.direction == "left"
@@ -422,8 +420,8 @@ def test_without_sound_a_vehicle_stands_with_the_existence_its_dynamics_give(
 
 @given(st.floats(0.05, 0.9), st.floats(LEAST_HEARD, 1.0))
 @settings(max_examples=10, deadline=None)
-def test_absence_counts_as_far_as_a_vehicle_would_have_been_heard(chance: float, share: float) -> None:
-    """The odds of one that comes fall at most to the chance that it was masked, whatever is read."""
+def test_absence_counts_only_for_audible_vehicles(chance: float, share: float) -> None:
+    """The odds of a coming vehicle fall at most to the probability that it was masked."""
     world, quiet = WorldFilter(), SignatureEvidence(("left", "right"), (-9.0, -9.0), 0.0, 0.0)
     empty = both_sides((1e-6, 1e-6), (1e-6, 1e-6), "coming_3s")
     for number in range(1, 12):
@@ -439,7 +437,7 @@ def test_absence_counts_as_far_as_a_vehicle_would_have_been_heard(chance: float,
 
 
 def passing(excess_db: float) -> list[WorldState]:
-    """Return the states while a vehicle is in view for two seconds, and for four after it has left."""
+    """Return the states while a vehicle is visible for two seconds, and for four seconds after."""
     groups = np.full((2, len(GROUPS)), 0.01)
     groups[:, GROUPS.index("none")] = 1.0
     empty = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1)
@@ -458,26 +456,26 @@ def passing(excess_db: float) -> list[WorldState]:
     return found
 
 
-def test_beside_a_vehicle_in_view_heard_says_that_it_masks() -> None:
+def test_a_visible_vehicle_is_reported_as_masking() -> None:
     shares = []
     for excess_db in (6.0, 30.0):
         states = passing(excess_db)
         (beside,), (later,) = states[15].heard or (), states[-1].heard or ()
         assert beside.reason == "masked by a vehicle in view" and beside.since_ns < 10**9
-        # The ear itself works: the belief follows it, and a budget is stated.
+        # The sound is still usable, so the belief follows it and the budget holds.
         assert LEAST_HEARD <= beside.share < 0.75 and states[15].calibrated == states[-1].calibrated
         assert (later.share, later.reason) == (1.0, None)
         shares.append(beside.share)
     assert shares[1] < shares[0]
 
 
-def test_what_masks_says_how_well_could_be_heard_and_moves_no_belief() -> None:
+def test_the_excess_level_of_a_masker_does_not_change_the_belief() -> None:
     for faint, loud in zip(passing(0.0), passing(30.0), strict=True):
         assert [cue.risk for cue in faint.cues] == [cue.risk for cue in loud.cues]
         assert faint.entities == loud.entities
 
 
-def test_a_source_that_falls_silent_gives_no_news() -> None:
+def test_a_silent_source_is_reported() -> None:
     rng, world = np.random.default_rng(0), WorldFilter()
     for number in range(1, 5):
         world = world.update(hop(rng, number, sequence=True))
@@ -491,8 +489,8 @@ def test_a_source_that_falls_silent_gives_no_news() -> None:
 
 @given(SEEDS)
 @settings(max_examples=5, deadline=None)
-def test_without_a_sequence_the_explanations_are_those_of_the_rates(seed: int) -> None:
-    """No window at all: the equilibrium stays, whatever the steps."""
+def test_without_windows_the_hypotheses_stay_at_equilibrium(seed: int) -> None:
+    """Without windows the equilibrium stays, whatever the steps."""
     rng, world = np.random.default_rng(seed), WorldFilter(Context())
     start = world.belief.hypotheses
     for step_s in rng.uniform(0.0, 2.0, 10).tolist():

@@ -1,4 +1,4 @@
-"""Every published quantity follows what is measured: held at one value, it would be noticed here."""
+"""Every published quantity changes with the measurements."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ SECOND_NS, START_NS = 10**9, 7200 * 10**9
 
 
 def reading(rng: np.random.Generator, comes: tuple[str | None, str | None], alone: float) -> SequenceReading:
-    """Return what is read where one comes within such a time on each side; `alone`: or only on the other."""
+    """Return a reading with a time bin per side; `alone` adds weight to the other side only."""
     groups = rng.uniform(1e-4, 1e-2, (2, len(GROUPS)))
     for side, name in enumerate(comes):
         groups[side, GROUPS.index(name or ("other" if any(comes) else "none"))] += rng.uniform(1.0, 1.2)
@@ -48,7 +48,7 @@ def reading(rng: np.random.Generator, comes: tuple[str | None, str | None], alon
 def street(
     rng: np.random.Generator, hops: int, sequence: bool
 ) -> Iterator[Measurement | PositionScan | Odometry]:
-    """Yield a vehicle heard on the left, one on either side, two; one in view; messages, a radar, a drive."""
+    """Yield hidden vehicles left, on either side and on both, a visible one, messages, radar and odometry."""
     two, phases = ("coming_2s", "coming_2s"), [("coming_2s", None)]
     phases += [two, two, two, ("coming_8s", "coming_8s"), (None, None), ("coming_0.5s", None)]
     for hop in range(1, hops + 1):
@@ -86,7 +86,7 @@ def street(
             source=("acoustic", "roof")[hop % 2],
             sequence=read if sequence else None,
         )
-        if hop % 4 == 0 and (hop > 24 or not sequence):  # Whom they place is no half of one of unknown side
+        if hop % 4 == 0 and (hop > 24 or not sequence):  # An entity with a position has no unknown side
             spread = np.diag(rng.uniform(0.1, 0.4, 4))
             there = Position(
                 (9.0, 25.0 - 0.3 * hop),
@@ -112,7 +112,7 @@ def street(
 
 
 def odd_deliveries(last: Measurement) -> Iterator[Measurement | PositionScan]:
-    """Yield what comes late, twice, far too late, far ahead, and more than is kept."""
+    """Yield repeated, late, too late and future measurements, and too many boxes and positions."""
     yield last
     yield replace(last, stamp_ns=last.stamp_ns - 10**8 - 1)
     yield replace(last, stamp_ns=last.stamp_ns - 9 * SECOND_NS)
@@ -126,7 +126,7 @@ def odd_deliveries(last: Measurement) -> Iterator[Measurement | PositionScan]:
 
 
 def states() -> Iterator[WorldState]:
-    """Yield the snapshots of streets, with a sequence, a budget, other corners, and one that is watched."""
+    """Yield snapshots with a sequence, a budget, other corners, no model and a monitored budget."""
     rng = np.random.default_rng(0)
     there = Context(
         rates=Rates(*rng.uniform(0.01, 0.1, 6).tolist()),
@@ -158,7 +158,7 @@ def states() -> Iterator[WorldState]:
             yield world.state
         yield world.predict(2.0).state
         yield world.refused(3).state
-    # A camera watches the budget, finds it broken, and one that comes is no longer warned of.
+    # A camera monitors the budget, which breaks; a later vehicle is not announced.
     world = WorldFilter(start_ns=WATCHED_NS)
     for one in (*false_alarms(), *arrival(500, level=2.0)):
         world = world.update(one)

@@ -1,4 +1,4 @@
-"""Who is in one lane with whom, in front of whom, and who will cross the path of the ego vehicle."""
+"""Relations: same lane, in front of, conflict with the path of the ego vehicle, occlusion."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ SILENT, NEUTRAL = NotUsable("not scripted"), SignatureEvidence(("left", "right")
 def seen(
     *rows: tuple[float, float, float, float], context: Context | None = None
 ) -> dict[tuple[str, str, str], float]:
-    """Return the relations of vehicles that a radar has found, by their ends ("ego", "0", "1") and kind."""
+    """Return relations of radar detections by their ends ("ego", "0", "1") and kind."""
     positions = [Position(row[:2], SPREAD, row[2:], 0.9) for row in rows]
     state = (
         WorldFilter(context or Context()).update(PositionScan("radar", 0, tuple(positions), ALL_ROUND)).state
@@ -50,7 +50,7 @@ def test_the_chance_to_be_in_the_lane_of_the_ego_vehicle_is_that_of_draws(x: flo
     assert told.get(("0", "ego", "in_front_of"), 0.0) == pytest.approx(ahead, abs=0.06)
 
 
-def test_of_two_in_a_lane_one_is_in_front_and_oncoming_traffic_is_in_neither() -> None:
+def test_two_vehicles_in_a_lane_are_ordered_without_oncoming_traffic() -> None:
     told = seen((10.0, 20.0, 0.0, -8.0), (10.0, 30.0, 0.0, -8.0), (13.5, 25.0, 0.0, 8.0))
     assert told["0", "1", "in_front_of"] > 0.95 and told["0", "1", "same_lane"] > 0.95
     assert ("1", "0", "in_front_of") not in told
@@ -67,12 +67,12 @@ def test_of_two_in_a_lane_one_is_in_front_and_oncoming_traffic_is_in_neither() -
         ((10.0, 12.0, 0.0, 0.0), False),  # Stands
     ],
 )
-def test_who_crosses_the_path_within_five_seconds_conflicts_with_it(row, likely: bool) -> None:
+def test_a_crossing_within_five_seconds_is_a_conflict(row, likely: bool) -> None:
     chance = seen(row).get(("0", "ego", "conflicts_with_ego_path"), 0.0)
     assert chance > 0.9 if likely else chance < 0.1
 
 
-def test_an_ego_vehicle_that_drives_passes_before_who_crosses_behind_it() -> None:
+def test_a_crossing_behind_a_driving_ego_vehicle_is_no_conflict() -> None:
     row = (20.0, 24.0, 0.0, -6.0)  # On the axis in four seconds, when an ego at 8 m/s is beyond
     standing, driving = (
         seen(row, context=Context(ego_speed_mps=speed)).get(("0", "ego", "conflicts_with_ego_path"), 0.0)
@@ -81,7 +81,7 @@ def test_an_ego_vehicle_that_drives_passes_before_who_crosses_behind_it() -> Non
     assert standing > 0.9 and driving < 0.1
 
 
-def test_who_is_announced_behind_a_corner_approaches_from_its_arm() -> None:
+def test_a_message_behind_a_corner_approaches_from_its_arm() -> None:
     def arm(vy: float) -> float:
         there = Position((10.0, 14.0), SPREAD, (0.0, vy), 0.95)
         relations: tuple[Relation, ...] = (
@@ -92,8 +92,8 @@ def test_who_is_announced_behind_a_corner_approaches_from_its_arm() -> None:
     assert arm(-6.0) > 0.9 and arm(6.0) < 0.1
 
 
-def test_relations_name_only_what_the_snapshot_holds() -> None:
-    """Over 500 steps in which vehicles of two lanes come and go, and of which some are hidden."""
+def test_relations_refer_only_to_entities_of_the_snapshot() -> None:
+    """In 500 steps vehicles of two lanes appear and leave, some of them hidden."""
     rng, world, ended, named = np.random.default_rng(3), WorldFilter(), 0, 0
     there = list[np.ndarray]()
     for step in range(1, 501):
@@ -111,11 +111,11 @@ def test_relations_name_only_what_the_snapshot_holds() -> None:
     assert named > 2_500 and ended > 250
 
 
-# Law 17: what moves behind an occluder is hidden by it, whoever had found it.
+# Law 17: an occluder hides an object behind it, whichever sensor found it.
 
 
 def driven_behind(way, speed_mps, sensor, returns, rng):
-    """Yield seconds since a car has passed a known corner, and the state; radar or boxes, 10 a second."""
+    """Yield the states 0.3 to 1.5 s after a car has passed a known corner, by radar or boxes at 10 Hz."""
     corners = corner_at("left", (8.0, 5.0), 14.0), corner_at("right", (8.0, -5.0), 14.0)
     world = WorldFilter(Context(occluders=corners, view_half_angle_rad=0.9))
     edge = 0.625
@@ -129,7 +129,7 @@ def driven_behind(way, speed_mps, sensor, returns, rng):
             car = Position((x, way * y), tuple(map(tuple, 0.09 * np.eye(4))), (0.0, way * vy))
             world = world.update(PositionScan("radar", stamp_ns, (car,) if found else (), searched))
         else:
-            # What the corner leaves of it
+            # The visible part of the car
             ends = math.atan2(y - 2.2, 14.0), min(math.atan2(y + 2.2, 14.0), math.atan(edge))
             width_rad = ends[1] - ends[0]
             seen = since_s < 0.0 and width_rad > 0.0 and rng.random() < 0.9
@@ -148,7 +148,7 @@ def driven_behind(way, speed_mps, sensor, returns, rng):
     st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=15, deadline=None)
-def test_what_drives_behind_a_known_corner_is_hidden_by_it_within_three_tenths(way, speed, by, seed):
+def test_a_car_behind_a_known_corner_is_hidden_within_0_3_s(way, speed, by, seed):
     states = list(driven_behind(way, speed, *by, np.random.default_rng(seed)))
     assert states
     for state in states:
@@ -196,8 +196,8 @@ def test_a_car_that_passes_behind_a_reported_van_keeps_its_identity(way, rate, v
 
 @given(st.floats(0.8, 1.3), st.sampled_from([1.0, -1.0]), st.floats(2.0, 4.5))
 @settings(max_examples=10, deadline=None)
-def test_what_stands_in_front_of_the_wall_is_in_view(azimuth, way, beside_m):
-    """On the near pavement, past the azimuth of the corner, and nearer than the wall that begins there."""
+def test_an_object_in_front_of_the_wall_is_visible(azimuth, way, beside_m):
+    """It is beyond the azimuth of the corner but nearer than the wall."""
     corners = corner_at("left", (8.0, 5.0), 14.0), corner_at("right", (8.0, -5.0), 14.0)
     world, place = WorldFilter(Context(occluders=corners)), (beside_m / math.tan(azimuth), way * beside_m)
     walks = Position(place, tuple(map(tuple, 0.1 * np.eye(4))), (0.0, 0.0))
@@ -210,8 +210,8 @@ def test_what_stands_in_front_of_the_wall_is_in_view(azimuth, way, beside_m):
 
 @given(st.sampled_from([1.0, -1.0]), st.floats(0.15, 0.5), st.integers(1, 4))
 @settings(max_examples=10, deadline=None)
-def test_messages_that_carry_nothing_leave_how_likely_a_vehicle_is_hidden(way, rate, between):
-    """Law 9: towards an assumed corner, with empty odometry of a standing ego between the looks."""
+def test_empty_messages_leave_the_hidden_probability_unchanged(way, rate, between):
+    """Law 9: a car approaches an assumed corner; empty odometry comes between the looks."""
     alone = crowded = WorldFilter()
     for hop in range(40):
         stamp_ns, azimuth = 10**9 + hop * 10**8, way * (0.2 + rate * hop / 10)

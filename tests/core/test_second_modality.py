@@ -1,4 +1,4 @@
-"""V2X beacons through the same abduction and the same filter as sound: the example, held to its claims."""
+"""V2X beacons use the same abduction and the same filter as sound: tests of the example."""
 
 import ast
 import importlib.util
@@ -34,7 +34,7 @@ def last(states):
     return list(states)[-1]
 
 
-def test_hidden_by_radio_then_visible_with_the_same_id(v2x):
+def test_a_beacon_is_hidden_then_visible_with_the_same_id(v2x):
     beacons = v2x.approach_from_left()
     states = list(v2x.run(beacons, v2x.ScriptedCamera(beacons, t0_s=4.0)))
     at = {state.stamp_ns: state for state in states}
@@ -43,7 +43,7 @@ def test_hidden_by_radio_then_visible_with_the_same_id(v2x):
     assert (hidden.status, hidden.direction, seen.status) == ("hidden", "left", "visible")
     assert hidden.id == seen.id
     assert at[nanoseconds(3.0)].risk > 0.9
-    # One in six is followed by another one, until beacons are heard beside the vehicle again.
+    # One vehicle in six is followed by another one.
     assert at[nanoseconds(4.5)].risk < 0.2 and at[nanoseconds(5.5)].risk < 0.05
     assert hidden.tta_s == pytest.approx(15.0**2 / 8.0 / 15.0 * (1 + 100 / 225), rel=0.3)
     advisory = [s.stamp_ns for s in states if any(cue.advisory for cue in s.cues)]
@@ -51,10 +51,10 @@ def test_hidden_by_radio_then_visible_with_the_same_id(v2x):
     assert max(advisory) <= nanoseconds(4.3)
 
 
-def test_a_forged_beacon_in_plain_view_is_refuted_by_what_the_camera_does_not_see(v2x):
-    """A claim to stand in the open, with the power of the open: only the missing car tells.
+def test_a_forged_visible_beacon_is_refuted_by_the_camera(v2x):
+    """Claim and power fit a visible car; only the missing detection contradicts them.
 
-    It tells as far as the camera is known to work: the longer claims go on, the likelier it is broken.
+    The evidence depends on whether the camera works: repeated claims make a broken camera likelier.
     """
     signature = v2x.RadioSignature()
     plain = v2x.Beacon(0, 20.0, 0.0, -5.0, 0.0, signature.transmit_dbm - signature.loss_at_1_m_db - 26.0)
@@ -66,12 +66,12 @@ def test_a_forged_beacon_in_plain_view_is_refuted_by_what_the_camera_does_not_se
     assert refuted.cues[0].hypotheses.none > 0.9
     assert believed.cues[0].hypotheses.visible > 0.9
     assert refuted.cues[0].hypotheses.none > doubted.cues[0].hypotheses.none > 0.1
-    # A camera that misses almost everything refutes nothing.
+    # A camera that misses 99 % does not refute the claim.
     blind = last(v2x.run(forged, v2x.ScriptedCamera([], t0_s=0.0, miss_rate=0.99)))
     assert blind.cues[0].hypotheses.visible > 0.9
 
 
-def test_a_beacon_whose_power_belies_its_claim_is_nobody(v2x):
+def test_a_beacon_of_implausible_power_makes_no_entity(v2x):
     far_too_weak = [
         replace(beacon, power_dbm=beacon.power_dbm - 30.0) for beacon in v2x.approach_from_left(3.0)
     ]
@@ -80,7 +80,7 @@ def test_a_beacon_whose_power_belies_its_claim_is_nobody(v2x):
     assert state.entities == ()
 
 
-def test_what_the_camera_is_asked_for_follows_from_the_claim(v2x):
+def test_the_camera_query_follows_the_claimed_class(v2x):
     asked = []
 
     class Spy:
@@ -103,7 +103,7 @@ def test_what_the_camera_is_asked_for_follows_from_the_claim(v2x):
 
 
 def test_beacons_and_sound_share_one_filter(v2x):
-    """Sound alone leaves doubt, beacons alone leave doubt; together they are believed, as one entity."""
+    """Sound and beacons together raise the belief above each of them and form one entity."""
     doubtful = v2x.RadioSignature(loss_std_db=12.0)
     beacons = v2x.approach_from_left(2.0)
     radio = v2x.BeaconAdapter(doubtful).measure(beacons)
@@ -130,14 +130,14 @@ def test_the_examples_import_from_one_module(example):
     assert {module for module in imported if module.startswith("worldstate")} == {"worldstate"}
 
 
-def test_it_runs_as_a_program(v2x, capsys):
+def test_the_beacon_example_runs_as_a_program(v2x, capsys):
     v2x.main()
     out = capsys.readouterr().out
     assert "hidden" in out
     assert "visible" in out
 
 
-def test_presence_answers_the_same_whatever_the_modality(v2x):
+def test_a_beacon_gets_a_present_answer_from_the_camera(v2x):
     beacon = v2x.approach_from_left()[-10]
     camera = v2x.ScriptedCamera([beacon], t0_s=0.0)
     (measurement,) = v2x.BeaconAdapter(vision=camera).measure([beacon])
