@@ -1,4 +1,4 @@
-"""Small inputs of every kind, and what a bad disk or a bad hand makes of them."""
+"""Small input files of every kind, and functions that damage them."""
 
 import io
 import json
@@ -11,6 +11,8 @@ import soundfile
 from scripted_states import scripted_states
 
 from worldstate import WorldFilter, WorldState
+from worldstate.abduction.signature.site_estimate import SiteEstimate
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.export.log_messages import mcap_file, state_messages
 from worldstate.adapters.files.array_file import write_array_xml
@@ -25,7 +27,7 @@ from worldstate.simulation.dataset.dataset import LogRow, write_log
 from worldstate.smoothing.learned_street import LearnedStreet
 
 RATE_HZ = 8000
-# What stands in the place of a number, a text or a bracket: too large, of another type, too deep, too long.
+# Replacements of a number, a text or a bracket: too large, of another type, too deep, too long.
 WRONG = (
     *("-1", "0", "1e308", "-1e308", "1e-320", "1e999", "NaN", "9223372036854775808", "1" + "0" * 400),
     *("null", "true", '""', '"\\ud800"', '"' + "x" * 100_000 + '"', "[]", "{}", "[[]]", "[" * 3000, ",", ""),
@@ -35,7 +37,7 @@ TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?|\w+|[\[\
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return bytes as a bad disk or a bad hand leaves them: changed, cut, doubled or filled with zeros."""
+    """Return bytes with some of them changed, removed, repeated or set to zero."""
     at, end = sorted(rng.integers(0, len(data) + 1, 2).tolist())
     kind = rng.integers(4)
     if kind == 0:
@@ -47,10 +49,10 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def mistyped(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return a text in which one to three numbers, words or brackets are others, which often parses."""
+    """Return a text with one to three replaced numbers, words or brackets, which often still parses."""
     text = data.decode()
     for _ in range(rng.integers(1, 4)):
-        # A model is nearly all numbers: every second time it is a text, or a name, which stays a text.
+        # A model is mostly numbers, so every second replacement is a text; keys stay texts.
         at = int(rng.integers(max(len(text), 1)))
         one = (TEXT if rng.integers(2) else TOKEN).search(text, at) or TOKEN.search(text)
         if one is None:
@@ -62,7 +64,7 @@ def mistyped(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def reshaped(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return npz in which an array is missing, or has other numbers, another type or another shape."""
+    """Return npz with an array removed or with other numbers, type or shape."""
     with np.load(io.BytesIO(data)) as read:
         arrays = dict(read)
     name = list(arrays)[rng.integers(len(arrays))]
@@ -77,7 +79,7 @@ def reshaped(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def spoilt(name: str, data: bytes, rng: np.random.Generator) -> bytes:
-    """Return what is left of a file of this name."""
+    """Return damaged content of a file of this name."""
     suffix = Path(name).suffix
     other = {".npz": reshaped}.get(suffix, damaged if suffix in BINARY else mistyped)
     return (damaged if rng.integers(3) == 0 else other)(data, rng)
@@ -87,7 +89,7 @@ BINARY = ".wav", ".mcap", ".db3", ".onnx"
 
 
 def write_inputs(folder: Path) -> None:
-    """Write one of every kind."""
+    """Write one file of every kind."""
     rng = np.random.default_rng(1)
     soundfile.write(folder / "sound.wav", rng.normal(0, 0.1, (9000, 4)), RATE_HZ, "PCM_16")
     _write_arrays(folder)
@@ -113,7 +115,9 @@ def _write_arrays(folder: Path) -> None:
 def _write_street(folder: Path) -> None:
     save_model(folder / "model.json", read_model())
     world = WorldFilter(start_ns=1).predict_to(10**9)
-    save_checkpoint(folder / "belief.json", Checkpoint(world))
+    save_checkpoint(folder / "belief.json", Checkpoint(world, SiteEstimate.start(4)))
+    counts = FamilyCounts(((9,) * 5,) * 2, ((0, 1, 3, 6, 9),) * 2, (9,) * 5, (0,) * 5)
+    save_miss_rates(folder / "beta.json", MissRates((0.0, 15.0, 37.0), {"noise": counts}, {"detector": "x"}))
     write_street(folder / "street.json", LearnedStreet("Elm Street"))
     left = {"direction": "left", "corner_m": [5.0, 3.2], "crossing_m": 9.0, "speed_mps": 8.0}
     context = {"arms": [left, {"direction": "right", "open": True}], "ego_speed_mps": 0.0, "site": "Elm"}

@@ -1,4 +1,4 @@
-"""Sound of any rate from 8 kHz on is heard as that of 48 kHz is, from files, pipes, bags and microphones."""
+"""Sound of any rate from 8 kHz up gives the states of 48 kHz, from files, pipes, bags and microphones."""
 
 import io
 from collections.abc import Callable
@@ -27,7 +27,7 @@ from worldstate.commissioning.commission import commission
 from worldstate.commissioning.heard_stream import CommissionSettings, hear_recording, quick_settings
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
-from worldstate.ground import InvalidArgumentError, OutOfDomainError, wrap_angle
+from worldstate.ground import wrap_angle
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.measurement import Bearing
 from worldstate.simulation.dataset.recording import simulate_recording
@@ -50,9 +50,9 @@ class Heard:
     sound: Float32Array
 
     def at(self, rate: int) -> Float32Array:
-        """Return the sound as scipy resamples the whole of it.
+        """Return the whole sound resampled by scipy.
 
-        Its own filter of ten periods bends the band by so much that a tree's question is answered otherwise.
+        The default filter of scipy changes the band enough to change decisions of the trees.
         """
         up, down = Fraction(rate, FULL_HZ).as_integer_ratio()
         longest = max(up, down)
@@ -79,7 +79,7 @@ def heard(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     if request.param == COMMISSIONED:
         model = commission(RING, quick_settings(CommissionSettings()), tmp_path_factory.mktemp("streams"))
     elif array is RING:
-        # As `model make` makes one of an array: any windows that depend on all of the feature will do.
+        # As `model make` does for an array; any window model that uses the whole feature is suitable.
         domain = domain_of(RING, [6000], ["SA1"])
         model = replace(model, signature=replace(model.signature, domain=domain))
     drawn = replace(draw_settings("SA1", "left", rng, duration_s=6.0), sample_rate_hz=float(FULL_HZ))
@@ -92,7 +92,7 @@ def at_full_rate(heard: Heard) -> list[Step]:
 
 
 def chances(step: Step) -> dict[tuple[str, str], float]:
-    """Return the risk of each side and, where they are said, its chances within so many seconds."""
+    """Return the risk of each side and, if present, its probabilities by horizon."""
     return {
         (cue.direction, within): chance
         for cue in step.state.cues
@@ -102,7 +102,7 @@ def chances(step: Step) -> dict[tuple[str, str], float]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("rate", RATES)
-def test_the_same_sound_is_heard_alike_at_any_rate(heard: Heard, at_full_rate: list[Step], rate: int) -> None:
+def test_states_do_not_depend_on_the_sample_rate(heard: Heard, at_full_rate: list[Step], rate: int) -> None:
     if heard.array is not RING and rate not in (16_000, 44_100):
         pytest.skip("eight times the microphones take eight times as long")
     found = heard.steps(heard.pipe(rate))
@@ -161,7 +161,7 @@ def test_a_run_of_any_rate_ends_in_states(heard: Heard, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rate", [44_056, 43_000, 47_000, 7_000])
-def test_what_a_card_calls_its_rate_is_heard_with_the_stamps_of_its_samples(rate: int) -> None:
+def test_odd_sample_rates_keep_exact_stamps(rate: int) -> None:
     sound = np.random.default_rng(rate).standard_normal((round(1.25 * rate), 7)).astype(np.float32)
     front_end = FrontEnd(RING, rate, ListenSettings().front_end(RING, rate))
     frames = front_end.process(sound) + front_end.finish()
@@ -186,13 +186,6 @@ def test_blocks_of_any_length_give_the_same_frames_to_the_bit(rate: int, cuts: l
         np.testing.assert_array_equal(one.band_log_energy, other.band_log_energy)
 
 
-def test_a_band_that_was_not_recorded_is_refused() -> None:
-    # 8 kHz is heard at 12, where 5 kHz would have room and hold nothing.
-    chosen = ListenSettings(band_hz=(300.0, 5000.0)).front_end(RING, 8_000)
-    with pytest.raises(InvalidArgumentError, match="less than half the sample rate of 8000"):
-        FrontEnd(RING, 8_000, chosen)
-
-
 @pytest.mark.long
 def test_quiet_recordings_of_any_rate_set_an_alarm_alike(heard: Heard, tmp_path: Path) -> None:
     hops = []
@@ -209,24 +202,16 @@ def frames_of(heard: Heard, sound: Float32Array, rate: int) -> list[AcousticFram
 
 
 @pytest.mark.long
-def test_faults_are_those_of_the_recorded_samples(heard: Heard) -> None:
-    # Resampled, a clipped sound has no highest value, and repeated samples do not repeat.
+def test_faults_are_detected_before_resampling(heard: Heard) -> None:
+    # Resampling hides clipping and repeated samples.
     rate = 44_100
     sound = 0.5 * heard.at(rate) / np.abs(heard.sound).max()
     clipped = [one.health.clipped for one in frames_of(heard, np.clip(sound, -0.1, 0.1), rate)]
     at_full = np.clip(0.5 * heard.sound / np.abs(heard.sound).max(), -0.1, 0.1)
     expected = [one.health.clipped for one in frames_of(heard, at_full, FULL_HZ)]
     assert np.mean(clipped) == pytest.approx(np.mean(expected), rel=0.1) and max(clipped) > 0.001
-    # A quarter of a second is given twice.
+    # A quarter of a second is repeated.
     sound[2 * rate :][: rate // 4] = sound[: 2 * rate][-(rate // 4) :]
     frames = frames_of(heard, sound, rate)
     assert max(one.lost for one in frames) == pytest.approx(0.25, abs=0.02)
     assert "repeat" in {one.kind for one in frames[-1].health.dropouts}
-
-
-@pytest.mark.parametrize("rate", [3_000, 5_800])
-def test_too_low_a_rate_is_refused_with_what_to_do(rate: int) -> None:
-    noise = np.random.default_rng(0).uniform(-0.1, 0.1, (2 * rate, 56)).astype("<f4")
-    pipe = RawPcm(io.BytesIO(noise.tobytes()), rate, 56, "f32")
-    with pytest.raises(OutOfDomainError, match=f"at least 6000 Hz, got {rate} Hz: record at 8 kHz or more"):
-        list(listen_steps(open_source(pipe, array=ovad_array())))

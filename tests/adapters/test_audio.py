@@ -1,4 +1,4 @@
-"""Recordings: what comes out is what soundfile put in, in any block size."""
+"""Recordings are read exactly as soundfile wrote them, in blocks of any size."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def write(path: Path, samples: np.ndarray, container: str = "WAV", encoding: str
 
 
 @pytest.mark.parametrize(("container", "encoding"), FORMATS)
-def test_gives_back_what_was_written(tmp_path: Path, container: str, encoding: str) -> None:
+def test_reading_returns_the_written_samples(tmp_path: Path, container: str, encoding: str) -> None:
     samples = noise()
     with open_audio(write(tmp_path / "sound", samples, container, encoding), expect_channels=3) as source:
         blocks = list(source.blocks(4800))

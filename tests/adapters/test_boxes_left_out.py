@@ -1,4 +1,4 @@
-"""A box that does not count is no absence: classes by data set, sizes by image, and what is left out."""
+"""An ignored box is no absence: class names of data sets, box sizes and unknown classes."""
 
 import logging
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from worldstate.ground.errors import InputFileError
 from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing, Measurement
 
-# Of each data set: car, motorcycle, bus, truck, train, bicycle, person; then what is none of these.
+# Names per data set: car, motorcycle, bus, truck, train, bicycle, person, none of these.
 NAMES = {
     "coco": ("car", "motorcycle", "bus", "truck", "train", "bicycle", "person", "traffic light"),
     "kitti": ("Car Van", "", "", "Truck", "Tram", "Cyclist", "Pedestrian Person_sitting", ""),
@@ -57,7 +57,7 @@ NAMED = [
     for names, one in zip(row, CLASSES, strict=True)
     for name in names.replace("traffic ", "traffic-").split()
 ]
-# What may be a motor vehicle and is no class of the library.
+# Names that may be a motor vehicle but are no class of the library.
 UNKNOWN = (
     "Misc",
     "DontCare",
@@ -75,7 +75,7 @@ AHEAD = Bearing(0.0, 0.05)
 
 
 def moving(label: str, score: float = 0.9, height_px: float = 200.0, first_px: float = 700.0) -> DetectionLog:
-    """A box that crosses the middle of the image after two seconds."""
+    """Return a box that crosses the middle of the image after two seconds."""
     frames = []
     for k in range(40):
         left = first_px + 10.0 * k
@@ -113,18 +113,18 @@ def test_words_may_be_joined_by_capitals(source: str, name: str, expected: str |
 
 
 @pytest.mark.parametrize("name", [*UNKNOWN, "Milk Float"])
-def test_a_class_that_is_not_known_is_no_absence(name: str) -> None:
+def test_an_unknown_class_is_no_absence(name: str) -> None:
     said, boxes, look = answers(moving(name))
     assert isinstance(said, Unqueried) and boxes == ()
     assert isinstance(look.answer, Unqueried) and look.fault == NONE_COUNTS  # type: ignore[attr-defined]
     assert isinstance(answers(moving(name), DetectionFilter({name.upper()}))[0], Present)
 
 
-def test_numbers_are_those_of_the_form(tmp_path) -> None:
+def test_class_numbers_follow_the_file_format(tmp_path) -> None:
     rows = [{"image_id": 0, "category_id": k, "bbox": [0, 0, 9, 9], "score": 0.9} for k in (3, 8, 10, 90, 95)]
     labels = coco_log(tmp_path, rows).frames[0].labels
     assert labels == ("car", "truck", "traffic light", "toothbrush", "95")
-    # Counted from 0; and numbers that may be counted either way, which are then no class that is known.
+    # Numbers from 0, and ambiguous numbers, which give no known class.
     for used, expected in (((0, 2, 7), ["person", "car", "truck"]), ((1, 2, 5), ["person", None, None])):
         labels = coco_log(tmp_path, [{**rows[0], "category_id": k} for k in used]).frames[0].labels
         assert [name if class_name(name) in CLASSES else None for name in labels] == expected
@@ -152,7 +152,7 @@ def scaled(log: DetectionLog, by: float) -> DetectionLog:
 
 
 @given(
-    by=st.sampled_from([0.25, 0.5, 2.0]),  # Exact: no box changes its side of the least height
+    by=st.sampled_from([0.25, 0.5, 2.0]),  # Exact factors, so no box crosses the minimum height
     height_px=st.floats(50.0, 150.0),
     step_px=st.floats(0.0, 2.0),
     keep=st.sampled_from([DetectionFilter(), DetectionFilter(min_height_px=60.0)]),
@@ -181,7 +181,7 @@ def test_the_least_height_scales_with_the_image(height_px: int, least_px: float)
     boxes = np.array([[0.0, 0.0, 9.0, least_px - 0.1], [0.0, 0.0, 9.0, least_px + 0.1]])
     frame = DetectionFrame(boxes, np.full(2, 0.9), ("car", "Car"))
     assert frame.select(keep).tolist() == [1]
-    # The laboratory's sixty pixels are those of OVAD's images.
+    # The sixty pixels of the laboratory refer to OVAD's images.
     assert replace(DetectionFilter(min_height_px=60.0), image_height_px=1216).scale == 1.0
 
 
@@ -198,7 +198,7 @@ HEARD = SignatureEvidence(("left", "right"), hidden=(2.0, -1.0), visible=1.0, no
 
 
 def in_view(log: DetectionLog | None, hops: Sequence[int]) -> list[tuple[float, ...]]:
-    """Return P(in view) and the existence of what is seen, after each hop of a sound from ahead."""
+    """Return P(visible) and the existence of visible entities after each hop."""
     vision, world, told = None if log is None else VisionQuery(CAMERA, log), WorldFilter(), []
     for hop in hops:
         heard = Measurement(
@@ -216,7 +216,7 @@ def in_view(log: DetectionLog | None, hops: Sequence[int]) -> list[tuple[float, 
     label=st.sampled_from(["car", "truck", "Milk Float", "DontCare"]),
 )
 @settings(deadline=None, max_examples=25)
-def test_a_box_left_out_never_lowers_the_chance_of_what_is_in_view(
+def test_an_ignored_box_never_lowers_the_visible_hypothesis(
     score: float, height_px: float, label: str
 ) -> None:
     hops = range(12, 24)
@@ -226,7 +226,7 @@ def test_a_box_left_out_never_lowers_the_chance_of_what_is_in_view(
 
 @given(score=st.floats(0.01, 0.74), label=st.sampled_from(["car", "truck", "Milk Float"]))
 @settings(deadline=None, max_examples=25)
-def test_a_vehicle_whose_box_no_longer_counts_is_not_missed(score: float, label: str) -> None:
+def test_an_ignored_box_is_no_miss(score: float, label: str) -> None:
     counted, left = moving("car"), moving(label, score)
     beside = DetectionFrame(np.array([[100.0, 500.0, 200.0, 700.0]]), np.array([0.9]), ("car",))
     frames = (*counted.frames[:17], *(joined(one, beside) for one in left.frames[17:]))
@@ -240,19 +240,19 @@ def joined(one: DetectionFrame, other: DetectionFrame) -> DetectionFrame:
     return DetectionFrame(boxes, scores, one.labels + other.labels)
 
 
-def test_boxes_that_cannot_be_placed_are_no_absence_anywhere() -> None:
+def test_boxes_of_another_scale_are_no_absence() -> None:
     for most in (0.57, 1.0, 1.004):  # a detector's boxes may reach beyond the image
         parts = scaled(moving("car"), most / 1290.0)
         with pytest.raises(InputFileError, match="expected boxes in pixels"):
             VisionQuery(CAMERA, parts)
         with pytest.raises(InputFileError, match="expected boxes in pixels"):
             VisionQuery(CAMERA, None).see(AT_NS, parts.frames[20])
-    # Of images a quarter as large as the camera's: there the box stands elsewhere.
+    # In images of a quarter of the size the box is at another position.
     assert isinstance(answers(scaled(moving("car"), 0.25))[0], Unqueried)
 
 
 @pytest.mark.parametrize("size_px", [(640, 402), (1280, 720), (1936, 1217), (3840, 2412)])
-def test_listed_images_have_the_size_of_the_cameras(size_px: tuple[int, int], tmp_path) -> None:
+def test_listed_images_must_have_the_size_of_the_camera(size_px: tuple[int, int], tmp_path) -> None:
     listed = {"images": [{"id": 0, "width": size_px[0], "height": size_px[1]}], "annotations": []}
     assert len(coco_log(tmp_path, listed, size_px=size_px)) == 1
     with pytest.raises(InputFileError, match=f"got {size_px[0]} x {size_px[1]}: width_px and height_px"):
@@ -260,13 +260,13 @@ def test_listed_images_have_the_size_of_the_cameras(size_px: tuple[int, int], tm
 
 
 @pytest.mark.parametrize("label", ["car", "truck"])
-def test_a_parked_box_that_does_not_count_was_read(label: str) -> None:
+def test_a_parked_ignored_box_is_an_absence(label: str) -> None:
     boxes = np.array([[900.0, 500.0, 1000.0, 550.0]])
     log = DetectionLog.at_rate([DetectionFrame(boxes, np.array([0.9]), (label,))] * 40, 10.0)
     assert isinstance(answers(log)[0], Absent)
 
 
-def test_a_source_of_which_no_box_counts_is_impaired_until_one_does(caplog) -> None:
+def test_a_camera_without_usable_boxes_is_impaired(caplog) -> None:
     log = moving("truck")
     good = moving("car").frames
     later = replace(log, frames=(*log.frames[:25], *good[25:]))

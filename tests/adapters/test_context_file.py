@@ -1,4 +1,4 @@
-"""A context file: edges by trigonometry, refusals by name, and a snapshot that says what it was told."""
+"""Context files: edges by trigonometry, errors with the key, and the context in the snapshot."""
 
 import json
 import math
@@ -36,10 +36,10 @@ def side_of(one: Occluder) -> SideGeometry:
 @given(
     st.floats(2.0, 9.0), st.floats(1.5, 8.0), st.floats(1.0, 15.0), st.floats(1.0, 15.0), st.integers(0, 8)
 )
-def test_who_comes_stands_where_the_plan_says(
+def test_the_hidden_azimuth_follows_the_plan(
     x_m: float, y_m: float, beyond_m: float, speed_mps: float, group: int
 ) -> None:
-    """Oracle: the place on the lane, so many seconds before the line of sight past the corner is crossed."""
+    """Oracle: the position on the lane at a given time before the line of sight is crossed."""
     crossing_m = x_m + beyond_m
     coming = np.zeros(len(COMING_S))
     coming[group] = 1.0
@@ -55,7 +55,7 @@ def test_who_comes_stands_where_the_plan_says(
         assert std_rad >= corner.edge_std_rad
 
 
-def test_a_file_says_what_stands_there_and_the_rest_is_usual(tmp_path: Path) -> None:
+def test_a_context_file_replaces_defaults(tmp_path: Path) -> None:
     context = read_context(
         written(tmp_path, arms=[RIGHT, LEFT], site="Elm Street", rates={**rates(), "arrival_hz": 0.01})
     )
@@ -63,7 +63,7 @@ def test_a_file_says_what_stands_there_and_the_rest_is_usual(tmp_path: Path) -> 
     assert context.rates.arrival_hz == 0.01 and context.view_half_angle_rad == Context().view_half_angle_rad
     assert [one.assumed for one in context.occluders] == [False, False]
     assert [one.assumed for one in read_context(written(tmp_path)).occluders] == [True, True]
-    # The snapshot says it, too, and a checkpoint keeps it.
+    # The snapshot has it, and a checkpoint keeps it.
     world = WorldFilter(context)
     said = json.loads(world.state.to_json())["context"]
     assert [one["assumed"] for one in said["occluders"]] == [False, False]
@@ -107,13 +107,13 @@ def rates() -> dict[str, float]:
         ({"ego_speed_mps": "fast"}, "ego_speed_mps"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(tmp_path: Path, keys: dict[str, object], said: str) -> None:
+def test_a_wrong_context_is_refused_with_its_key(tmp_path: Path, keys: dict[str, object], said: str) -> None:
     with pytest.raises((InputFileError, InvalidArgumentError), match=said):
         WorldFilter(read_context(written(tmp_path, **keys)))
 
 
 @pytest.mark.long
-def test_run_takes_the_place(approach, tmp_path: Path) -> None:
+def test_run_accepts_a_context_file(approach, tmp_path: Path) -> None:
     out, file = tmp_path / "s.jsonl", written(tmp_path, arms=[LEFT, RIGHT], site="Elm Street")
     given_array = ["--array", str(approach.array_path)]
     assert (

@@ -1,4 +1,4 @@
-"""Whatever a file holds is read or refused by name: no other error, no gigabyte, no wait."""
+"""Damaged files are read or raise a typed error, within limits of memory and time."""
 
 import io
 import os
@@ -21,6 +21,7 @@ from damaged_files import RATE_HZ, spoilt, write_inputs
 from worldstate.adapters.audio.sound_file import open_audio, open_sound
 from worldstate.adapters.camera.detections import read_any_detections
 from worldstate.adapters.camera.detectors import open_onnx
+from worldstate.adapters.camera.miss_rates import load_miss_rates
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
@@ -38,7 +39,7 @@ from worldstate.ground.errors import WorldstateError
 from worldstate.operations.labelling.street_passes import read_street
 from worldstate.operations.recordings.hop_table import load_streams
 
-# Seconds of the processor; where nothing is computed, the alarm comes after six times as many.
+# Seconds of processor time; without computation the limit is six times as long.
 MOST_BYTES, MOST_S = 1 << 30, 10
 FEW, MANY = 5, 300
 BOMB_MIB, MCAP = 1500, b"\x89MCAP0\r\n"
@@ -71,6 +72,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "model.json": read_model,
     "belief.json": read_checkpoint,
     "street.json": read_street,
+    "beta.json": load_miss_rates,
     "context.json": read_context,
     "odometry.csv": read_odometry,
     "truth.json": lambda path: read_true_tracks(path.parent),
@@ -116,7 +118,7 @@ def write_detector(path: Path) -> None:
 
 
 def read_each(name: str, folder: Path, seeds: range) -> int:
-    """Read a file once for each seed, each time spoilt in another way; return how many were refused."""
+    """Read a differently damaged file for each seed; return the number of errors."""
     data, refused = (folder / name).read_bytes(), 0
     READERS[name](folder / name)
     for seed in seeds:
@@ -133,13 +135,13 @@ def read_each(name: str, folder: Path, seeds: range) -> int:
 
 
 def limited() -> None:
-    """Let the system end this process after the time that a file may take, from now on."""
+    """Make the system end this process after the time limit of one file."""
     signal.setitimer(signal.ITIMER_PROF, MOST_S)
     signal.alarm(6 * MOST_S)
 
 
 def in_child(work: Callable[[], int], report: Path) -> None:
-    """Work in a process of its own, whose memory is measured and which the system ends when it hangs."""
+    """Run work in a child process with measured memory and a time limit."""
     child = os.fork()
     if not child:
         try:
@@ -171,7 +173,7 @@ def test_a_damaged_file_is_read_or_refused(name, times, whole, tmp_path):
 
 
 def zeros_zip(path: Path) -> None:
-    """Write npz whose one array says that it is short, and is followed by 1.5 GB of zeros."""
+    """Write npz with an array that claims to be short and has 1.5 GB of zeros."""
     head = io.BytesIO()
     np.lib.format.write_array(head, np.zeros(3), version=(1, 0))
     with (
@@ -184,7 +186,7 @@ def zeros_zip(path: Path) -> None:
 
 
 def long_zip(path: Path) -> None:
-    """Write npz whose one array says that it has 10^12 numbers."""
+    """Write npz with an array that claims 10^12 numbers."""
     head = io.BytesIO()
     shape = {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
     np.lib.format.write_array_header_1_0(head, shape)
@@ -200,7 +202,7 @@ def many_zip(path: Path) -> None:
 
 
 def zstd_frame(mib: int, *, stated: bool = True) -> bytes:
-    """Return a record of zeros as a frame, of which the head may leave out how many they are."""
+    """Return a record of zeros as a zstd frame, with or without its size in the header."""
     told = {"size": mib << 20} if stated else {}
     writing = zstandard.ZstdCompressor().compressobj(**told)
     head = struct.pack("<BQ", 0x80, (mib << 20) - 9)
@@ -209,27 +211,27 @@ def zstd_frame(mib: int, *, stated: bool = True) -> bytes:
 
 
 def lz4_frame(mib: int) -> bytes:
-    """Return zeros as a frame whose head leaves out how many they are."""
+    """Return zeros as an lz4 frame without its size in the header."""
     writing = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB)
     parts = [writing.begin(), *(writing.compress(bytes(1 << 20)) for _ in range(mib)), writing.flush()]
     return b"".join(parts)
 
 
 def mcap_chunk(codec: str, data: bytes, claimed: int) -> bytes:
-    """Return a chunk that claims a size, as a record."""
+    """Return a chunk record that claims a size."""
     named = codec.encode()
     head = struct.pack("<QQQII", 0, 0, claimed, 0, len(named)) + named + struct.pack("<Q", len(data))
     return struct.pack("<BQ", 6, len(head) + len(data)) + head + data
 
 
 def chunk_bomb(path: Path, codec: str, data: bytes, claimed: int) -> None:
-    """Write MCAP of ROS 2 with one chunk, whole but for an index, so that every reader decodes the chunk."""
+    """Write MCAP of ROS 2 with one chunk and no index, so that every reader decodes the chunk."""
     head = struct.pack("<BQI", 1, 12, 4) + b"ros2" + bytes(4)
     end = struct.pack("<BQI", 15, 4, 0) + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + MCAP
     path.write_bytes(MCAP + head + mcap_chunk(codec, data, claimed) + end)
 
 
-# Of a chunk: its codec, what it holds, what it claims to hold. Readers go on to a second frame of zstd.
+# Codec, content and claimed size of each chunk. Readers also decode a second zstd frame.
 CHUNK_BOMBS: dict[str, tuple[str, Callable[[], bytes], int]] = {
     "chunk": ("zstd", lambda: zstd_frame(BOMB_MIB), BOMB_MIB << 20),
     "secret": ("zstd", lambda: zstd_frame(BOMB_MIB), 1000),
@@ -240,7 +242,7 @@ CHUNK_BOMBS: dict[str, tuple[str, Callable[[], bytes], int]] = {
 
 
 def indexed_bag(path: Path, chunks: bytes, indices: list[tuple[int, int, int]]) -> None:
-    """Write MCAP of ROS 2 with an index that says where chunks stand and both of their sizes."""
+    """Write MCAP of ROS 2 with an index of the position and both sizes of each chunk."""
     head = MCAP + struct.pack("<BQI", 1, 12, 4) + b"ros2" + bytes(4)
     end = struct.pack("<BQI", 15, 4, 0)
     summary = len(head) + len(chunks) + len(end)
@@ -250,8 +252,8 @@ def indexed_bag(path: Path, chunks: bytes, indices: list[tuple[int, int, int]]) 
     path.write_bytes(head + chunks + end + struct.pack("<BQQQI", 2, 20, summary, 0, 0) + MCAP)
 
 
-def test_an_index_that_names_other_bytes_than_a_chunk_is_refused(tmp_path):
-    """The bomb lies in an attachment, which nobody decodes but a reader that trusts the index."""
+def test_an_index_outside_of_the_chunks_is_refused(tmp_path):
+    """The bomb is in an attachment, which only a reader that trusts the index would decode."""
     bomb, chunk = zstd_frame(BOMB_MIB), mcap_chunk("zstd", zstd_frame(1), 1 << 20)
     hidden = struct.pack("<BQ", 9, 44 + len(bomb)) + bytes(44) + bomb
     for index in ((len(chunk), len(bomb), BOMB_MIB << 20), (0, len(bomb), BOMB_MIB << 20)):
@@ -259,7 +261,7 @@ def test_an_index_that_names_other_bytes_than_a_chunk_is_refused(tmp_path):
         refused_by("bomb.mcap: expected an index of its chunks", bag, tmp_path)
 
 
-def test_honest_chunks_of_one_time_that_fill_the_memory_together_are_refused(tmp_path):
+def test_chunks_that_exceed_the_memory_together_are_refused(tmp_path):
     chunk = mcap_chunk("zstd", frame := zstd_frame(200), 200 << 20)
     places = [(i * len(chunk), len(frame), 200 << 20) for i in range(6)]
     indexed_bag(tmp_path / "many.mcap", chunk * 6, places)
@@ -267,7 +269,7 @@ def test_honest_chunks_of_one_time_that_fill_the_memory_together_are_refused(tmp
 
 
 def constant_bomb(path: Path) -> None:
-    """Write a model that fills 40 GB, 4 x 10^10 numbers being asked of one node."""
+    """Write a model with a node of 4 x 10^10 numbers, which would need 40 GB."""
     make, kind = onnx.helper, onnx.TensorProto
     image = make.make_tensor_value_info("images", kind.FLOAT, [1, 3, 32, 32])
     shape = onnx.numpy_helper.from_array(np.array([1, 100_000, 100_000], np.int64), "shape")
@@ -289,7 +291,7 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
 
 
 def refused_by(said: str, read: Callable[[Path], object], folder: Path) -> None:
-    """Check that a file is refused by name, within the memory and the time that a file may take."""
+    """Check that reading a file raises an error with its name, within memory and time limits."""
     name = said.partition(":")[0]
 
     def refused() -> int:
@@ -303,7 +305,7 @@ def refused_by(said: str, read: Callable[[Path], object], folder: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", BOMBS)
-def test_a_small_file_that_grows_is_refused(name, tmp_path):
+def test_an_expanding_file_is_refused(name, tmp_path):
     write, read = BOMBS[name]
     write(tmp_path / name)
     refused_by(name, read, tmp_path)
@@ -311,12 +313,12 @@ def test_a_small_file_that_grows_is_refused(name, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", CHUNK_BOMBS)
-def test_a_chunk_that_grows_is_refused_by_the_readers_of_logs_and_of_bags(kind, tmp_path):
+def test_an_expanding_chunk_is_refused(kind, tmp_path):
     codec, frame, claimed = CHUNK_BOMBS[kind]
     chunk_bomb(tmp_path / "bomb.mcap", codec, frame(), claimed)
     for read in (lambda path: list(read_messages(path, SNAPSHOT_TOPIC)), bag):
         refused_by("bomb.mcap", read, tmp_path)
-    # The metadata of a folder may name its files otherwise.
+    # The metadata of a folder may list files with other names.
     (folder := tmp_path / "folder").mkdir()
     (tmp_path / "bomb.mcap").rename(folder / "bomb.dat")
     with pytest.raises(WorldstateError, match=r"bomb\.dat: expected"):

@@ -1,4 +1,4 @@
-"""Labelled recordings to feature windows: the command, where sound is looked for, damage by line."""
+"""Feature windows of labelled recordings: the command, the search for sound, errors with the line."""
 
 import csv
 import json
@@ -61,7 +61,7 @@ def command(dataset, labels, out):
 
 
 def at_24_khz(sound: np.ndarray) -> np.ndarray:
-    """Return the feature as a model hears it: at the next rate whose bins are those of the published one."""
+    """Return the feature at the next rate that has the bins of the published one."""
     return published_feature(resample_poly(sound, 3, 2, window=("kaiser", 8.0)), ARRAY, 24_000)
 
 
@@ -100,7 +100,7 @@ def test_only_the_labels_are_needed(dataset, tmp_path):
         ("File", "nowhere.wav", "line 3: expected a file nowhere.wav"),
     ],
 )
-def test_what_is_wrong_is_named(dataset, tmp_path, column, value, problem, capsys):
+def test_a_wrong_label_is_refused_with_its_line(dataset, tmp_path, column, value, problem, capsys):
     rows = [list(row) for row in ROWS]
     rows[1][HEADER.index(column)] = value
     assert problem in refusal(capsys, dataset, write_labels(tmp_path / "l.csv", rows), tmp_path / "f.csv")
@@ -120,7 +120,7 @@ LOG = """ID,Environment,Class,T0
 """
 
 
-def test_without_labels_windows_lie_where_the_released_program_cuts_them(tmp_path, capsys):
+def test_without_labels_windows_equal_those_of_the_released_program(tmp_path, capsys):
     root, rng = tmp_path / "ovad", np.random.default_rng(1)
     sounds = {}
     for row in csv.DictReader(LOG.splitlines()):

@@ -1,4 +1,4 @@
-"""The table of feature windows: read as it is, refused by file and line."""
+"""The table of feature windows: exact reading, errors with file and line."""
 
 import csv
 
@@ -46,7 +46,7 @@ def test_columns_may_stand_in_any_order(tmp_path, table):
     np.testing.assert_array_equal(other.features, table.features)
 
 
-def test_groups_go_by_the_environment(table):
+def test_groups_follow_the_environment(table):
     assert table.group("static").environments.tolist() == ["SA1"] * 3
     assert table.group("dynamic").ids.tolist() == ["3_06_0003"]
     assert len(table.group("all")) == 4
@@ -54,8 +54,8 @@ def test_groups_go_by_the_environment(table):
         table.group("static").group("dynamic")
 
 
-def test_a_list_names_whole_recordings(table):
-    # The front window of recording 34 at SA1 goes with its hazard window; 34 at DB2 is another recording.
+def test_a_list_selects_whole_recordings(table):
+    # The front window of recording 34 at SA1 belongs to its hazard window; 34 at DB2 is another recording.
     assert table.only(["1_00_0001"]).ids.tolist() == ["1_00_0001", "0_00_0017"]
     assert table.without(["1_00_0001"]).ids.tolist() == ["2_00_0000", "3_06_0003"]
     with pytest.raises(InvalidArgumentError, match="ids"):
@@ -74,7 +74,7 @@ def test_a_list_names_whole_recordings(table):
         ("Environment", "X1"),
     ],
 )
-def test_a_bad_cell_is_named_by_file_and_line(tmp_path, column, value):
+def test_a_bad_cell_is_refused_with_file_and_line(tmp_path, column, value):
     rows = good_rows()
     rows[2][HEADER.index(column)] = value
     with pytest.raises(InputFileError, match=r"f\.csv: line 4"):

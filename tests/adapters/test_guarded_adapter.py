@@ -1,4 +1,4 @@
-"""A guard in the acoustic adapter: foreign sounds say less, warning signals as much, snapshots say why."""
+"""A guard in the acoustic adapter reduces the evidence of foreign sounds, not of warning signals."""
 
 from dataclasses import replace
 from functools import partial
@@ -21,28 +21,28 @@ from worldstate.state.world_state import WorldState
 
 RATE_HZ = 6000
 ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])
-# Noise of the microphones stands for sound: with watched channels it is not heard.
+# Independent noise is unusable if channels are watched.
 UNWATCHED = FrontEndSettings(nfft=feature_nfft(RATE_HZ), watch_channels=False)
 unwatched = partial(AcousticAdapter, ARRAY, RATE_HZ, front_end_settings=UNWATCHED)
 STEADY, SHARED = MEASURES.index("line holds"), MEASURES.index("together 2.2")
 
 
 class Alarmed:
-    """A model that hears a vehicle on the left whatever it is given."""
+    """A model with constant evidence of a vehicle on the left."""
 
     def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
         return SignatureEvidence(("left", "right"), (3.0, 0.0), -2.0, -1.0)
 
 
 class Silent:
-    """A model that hears that nothing is there, far beyond any guard's margin."""
+    """A model with constant evidence of no vehicle, beyond the margin of any guard."""
 
     def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
         return SignatureEvidence(("left", "right"), (-6.0, -6.0), -2.0, 0.0)
 
 
 def guard() -> DomainGuard:
-    """What its bands share makes a sound foreign, a line that holds a signal."""
+    """Return a guard for common modulation (foreign) and a steady line (signal)."""
     weights = np.zeros((3, len(MEASURES)))
     weights[1, SHARED], weights[2, STEADY] = 12.0, 20.0
     return DomainGuard(
@@ -56,7 +56,7 @@ def guard() -> DomainGuard:
 
 
 def sounds() -> dict[type, np.ndarray]:
-    """Three seconds of noise, of noise that swells four times a second, and of a tone."""
+    """Return three seconds of noise, of noise modulated at 4 Hz, and of a tone."""
     rng, time = np.random.default_rng(1), np.arange(3 * RATE_HZ) / RATE_HZ
     noise = 0.02 * rng.standard_normal((len(time), 3))
     swelling = noise * (1.05 + np.sin(8.0 * np.pi * time))[:, None]
@@ -65,7 +65,7 @@ def sounds() -> dict[type, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", [Familiar, Foreign, WarningSignal])
-def test_only_foreign_sounds_lose_their_evidence_and_the_snapshot_says_so(kind: type) -> None:
+def test_only_foreign_sounds_lose_evidence(kind: type) -> None:
     measured = unwatched(Alarmed(), guard=guard()).measure(sounds()[kind])
     assert [one.domain for one in measured[:11]] == [None] * 11
     last, plain = measured[-1], unwatched(Alarmed()).measure(sounds()[kind])[-1]

@@ -1,4 +1,4 @@
-"""Kinds of road users through the chain: heard, asked of the camera, carried by the entity."""
+"""Kinds of road users in the chain: sound, camera query and entity."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -34,7 +34,7 @@ from worldstate.measurement.measurement import Bearing, Measurement, Side, Sight
 
 RATE_HZ = 6000
 ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])
-# Noise of the microphones stands for sound: with watched channels it is not heard.
+# Independent noise is unusable if channels are watched.
 UNWATCHED = FrontEndSettings(nfft=feature_nfft(RATE_HZ), watch_channels=False)
 unwatched = partial(AcousticAdapter, ARRAY, RATE_HZ, front_end_settings=UNWATCHED)
 CLASSES = ("car", "truck", "unknown", "van")
@@ -42,7 +42,7 @@ NAMES = (*MEASURES, *BANDS)
 
 
 def by_colour() -> RoadUserModel:
-    """Deep sound is a truck's, high sound a car's."""
+    """Return a model in which low sound is a truck and high sound a car."""
     weights = np.zeros((4, len(NAMES)))
     low, high = NAMES.index("band 80"), NAMES.index("band 1850")
     weights[1, low], weights[1, high], weights[0, low], weights[0, high] = 3.0, -3.0, -3.0, 3.0
@@ -62,7 +62,7 @@ class Alarmed:
 
 
 class Asked:
-    """Keeps what it was asked for."""
+    """A channel that records its queries."""
 
     def __init__(self) -> None:
         self.labels: list[Collection[str] | None] = []
@@ -87,7 +87,7 @@ class Asked:
 @pytest.mark.parametrize(
     ("deep", "name", "labels"), [(True, "truck", {"truck", "bus"}), (False, "car", {"car"})]
 )
-def test_what_is_heard_is_what_the_camera_is_asked_for_and_the_entity_is(
+def test_the_acoustic_kind_sets_the_camera_query_and_the_entity(
     deep: bool, name: str, labels: set[str]
 ) -> None:
     camera = Asked()
@@ -106,14 +106,14 @@ def test_what_is_heard_is_what_the_camera_is_asked_for_and_the_entity_is(
         assert sum(said[-1].values()) <= 1.0 + 1e-9
     assert said[0] == {"unknown": 1.0}
     assert said[-1][name] > 0.8
-    # Once seen, a detector's word stands.
+    # After a detection the label of the detector is kept.
     assert world.memory is not None
     (track,) = world.memory.tracks.rows()
     seen = Tracks.of([replace(track, last_seen_ns=1, labels=(("car", 0.9),))])
     assert heard_as(seen, 0, measured[-1].kinds, StreetModel()) == (("car", 0.9),)
 
 
-def test_a_foreign_sound_is_of_no_kind_and_a_siren_is_of_its_own() -> None:
+def test_a_foreign_sound_has_no_kind_and_a_siren_its_own() -> None:
     model, silence = by_colour(), np.zeros(len(NAMES))
     assert heard_kinds(model, silence, Foreign("sounds like music", 3.0)) == ()
     siren = dict(heard_kinds(model, silence, WarningSignal("siren", 9.0)))
@@ -126,7 +126,7 @@ def test_a_foreign_sound_is_of_no_kind_and_a_siren_is_of_its_own() -> None:
 
 
 def query(*boxes: str, keep: frozenset[str] = frozenset({"car", "truck"})) -> VisionQuery:
-    """A camera that has seen these classes elsewhere and nothing now."""
+    """Return a camera with earlier detections of these classes and an empty image now."""
     box = np.array([[600.0, 300.0, 800.0, 600.0]])
     frames = [DetectionFrame(box, np.array([0.9]), (name,)) for name in boxes]
     empty = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
@@ -134,7 +134,7 @@ def query(*boxes: str, keep: frozenset[str] = frozenset({"car", "truck"})) -> Vi
     return VisionQuery(PinholeCamera.ovad(), log, keep=DetectionFilter(keep))
 
 
-def test_a_class_that_the_filter_drops_is_always_missed_and_alone_was_not_asked_for() -> None:
+def test_an_excluded_class_raises_the_miss_rate_or_is_unqueried() -> None:
     camera, ahead, now = query("car", "truck"), Bearing(0.0, 0.05), 200_000_000
     car, either = (camera.ask(now, ahead, labels) for labels in ({"car"}, {"car", "bus"}))
     assert isinstance(car, Absent)
@@ -143,7 +143,7 @@ def test_a_class_that_the_filter_drops_is_always_missed_and_alone_was_not_asked_
     assert isinstance(camera.ask(now, ahead, {"bicycle"}), Unqueried)
 
 
-def test_a_detector_that_calls_everything_a_car_is_asked_for_anything() -> None:
+def test_a_detector_with_one_class_is_queried_for_any_class() -> None:
     ahead, now = Bearing(0.0, 0.05), 200_000_000
     one_class = query("car", "car")
     assert (
@@ -153,7 +153,7 @@ def test_a_detector_that_calls_everything_a_car_is_asked_for_anything() -> None:
     )
 
 
-def test_without_a_word_on_kinds_an_entity_is_unknown() -> None:
+def test_without_kinds_an_entity_is_unknown() -> None:
     evidence, unknown = Alarmed().evidence(()), NotUsable("-")
     world = WorldFilter()
     for hop in range(1, 6):

@@ -1,4 +1,4 @@
-"""Absence measured: staged degradation, the camera's own health, miss rates on disk, the command."""
+"""Measured absence: degraded images, the health of a camera, files of miss rates, the command."""
 
 import json
 from dataclasses import asdict, astuple, replace
@@ -18,8 +18,6 @@ from worldstate.adapters.camera.camera_health import (
     FAMILIES,
     LEVELS,
     STRENGTHS,
-    CameraHealth,
-    DegradationLog,
     HealthMonitor,
     ImageQuality,
     darkness_of,
@@ -30,12 +28,11 @@ from worldstate.adapters.camera.camera_health import (
 )
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.detectors import MotionDetector
-from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates, save_miss_rates
+from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import open_video
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.cli.main import main
-from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
 from worldstate.ground.serialisation import decode
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
@@ -73,7 +70,7 @@ def test_darkness_is_the_inverse_of_its_strength(d):
 
 
 @pytest.mark.parametrize(("d", "sigma_px"), [(0.25, 2.0), (0.5, 4.0), (0.75, 8.0), (1.0, 16.0)])
-def test_blur_is_that_of_its_definition(d, sigma_px):
+def test_blur_equals_its_definition(d, sigma_px):
     blurred = degrade(GREY, "blur", d, np.random.default_rng(0)).astype(float)
     expected = np.stack(
         [gaussian_filter(GREY[:, :, i].astype(float), sigma_px, mode="mirror") for i in range(3)], -1
@@ -93,7 +90,7 @@ def test_any_strength_of_any_family_gives_an_image(d):
         assert degrade(GREY[:64, :96], family, d, np.random.default_rng(0)).shape == (64, 96, 3)
 
 
-def test_the_stages_are_those_of_their_definition():
+def test_darkness_and_noise_equal_their_definition():
     rng = np.random.default_rng(0)
     assert np.array_equal(degrade(GREY, "darkness", 1.0, rng), np.round(GREY * 0.06).astype(np.uint8))
     noise = degrade(np.full((200, 200, 3), 128, dtype=np.uint8), "noise", 0.5, rng) - 128.0
@@ -102,12 +99,9 @@ def test_the_stages_are_those_of_their_definition():
     assert degrade(GREY, "all", 0.0, rng) is GREY
 
 
-def test_the_same_seed_degrades_alike_and_damaged_frames_are_refused():
+def test_degradation_is_reproducible():
     one, two = (degrade(GREY, "all", 0.75, np.random.default_rng(5)) for _ in range(2))
     assert np.array_equal(one, two)
-    for frame, family, d in ((GREY / 2, "blur", 0.5), (GREY, "fog", 0.5), (GREY, "blur", 1.5)):
-        with pytest.raises(InvalidArgumentError):
-            degrade(frame, family, d, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +114,8 @@ def health():
 @pytest.mark.long
 @settings(deadline=None, max_examples=25)
 @given(st.sampled_from(["blur", "darkness", "noise"]), st.floats(0.0, 1.0), st.integers(0, 3))
-def test_d_is_read_from_another_image_of_the_same_camera(health, family, d, seed):
-    """The scale was learned in one street; blur is read from texture and so the least certain in another."""
+def test_degradation_is_estimated_from_another_image(health, family, d, seed):
+    """The scale is learned in one street; blur depends on texture and is least certain in another."""
     frame = next(street(1, seed=3 if family == "blur" else seed))
     seen = health.estimate(image_quality(degrade(frame, family, d, np.random.default_rng(seed))))
     assert asdict(seen)[family] == pytest.approx(d, abs=0.1)
@@ -129,7 +123,7 @@ def test_d_is_read_from_another_image_of_the_same_camera(health, family, d, seed
     assert max(others) <= 0.3
 
 
-def test_health_grows_with_every_family_and_never_falls(health):
+def test_the_estimate_grows_with_the_degradation(health):
     for family in STRENGTHS:
         seen = [
             asdict(health.estimate(image_quality(degrade(GREY, family, d, np.random.default_rng(0)))))[family]
@@ -138,7 +132,7 @@ def test_health_grows_with_every_family_and_never_falls(health):
         assert (np.diff(seen) > 0.1).all()
 
 
-def test_the_reference_follows_the_evening_but_not_a_lens_that_soils_for_ever(health):
+def test_the_reference_follows_dusk_but_not_a_dirty_lens(health):
     monitor, clean = HealthMonitor(health), image_quality(GREY)
     dusk = [
         monitor.update(
@@ -164,7 +158,7 @@ def synthetic_rates(beta=((0, 10, 30, 60, 99), (5, 20, 50, 80, 100)), clutter=(0
     return MissRates((0.0, 15.0, 37.0), {"noise": counts, "blur": hardly}, {"detector": "x"})
 
 
-def test_a_blur_that_the_detector_hardly_minds_is_no_strong_degradation(health):
+def test_harmless_blur_is_a_weak_degradation(health):
     rates = synthetic_rates()
     blurred = health.estimate(image_quality(degrade(GREY, "blur", 1.0, np.random.default_rng(0))))
     noisy = health.estimate(image_quality(degrade(GREY, "noise", 1.0, np.random.default_rng(0))))
@@ -180,7 +174,7 @@ counts = st.lists(st.integers(0, 40), min_size=5, max_size=5)
 
 
 @given(counts, counts, st.floats(1.0, 5.0))
-def test_rates_from_any_counts_are_monotone_probabilities_and_survive_the_disk(first, second, repeats):
+def test_miss_rates_are_monotone_and_read_back(first, second, repeats):
     looks = ((40,) * 5,) * 2
     family = FamilyCounts(looks, (tuple(first), tuple(second)), (40,) * 5, tuple(first))
     rates = MissRates((0.0, 10.0, 37.0), {"all": family}, {"a": "b"}, repeats=repeats)
@@ -193,37 +187,8 @@ def test_rates_from_any_counts_are_monotone_probabilities_and_survive_the_disk(f
     assert again.to_dict() == rates.to_dict()
 
 
-def test_damaged_files_are_typed_errors(tmp_path):
-    path = tmp_path / "beta.json"
-    save_miss_rates(path, synthetic_rates())
-    whole = path.read_text()
-    good = json.loads(whole)
-    for i in range(0, len(whole) - 2, 97):
-        path.write_text(whole[:i])
-        with pytest.raises(InputFileError, match=r"beta\.json"):
-            load_miss_rates(path)
-    looks = good["families"]["noise"]["looks"]
-    for key, value in {
-        "azimuth_deg": [0.0], "repeats": 0, "families": {}, "health": [], "provenance": {"a": 1},
-    }.items():  # fmt: skip
-        path.write_text(json.dumps(good | {key: value}))
-        with pytest.raises(InputFileError, match=r"beta\.json"):
-            load_miss_rates(path)
-    for wrong in (looks[:1], [["1"] * 5] * 2, [[1e999] * 5] * 2):
-        family = good["families"]["noise"] | {"looks": wrong}
-        path.write_text(json.dumps(good | {"families": {"noise": family}}))
-        with pytest.raises(InputFileError, match=r"beta\.json"):
-            load_miss_rates(path)
-    path.write_text(json.dumps(good | {"schema": {"name": "worldstate.MissRates", "version": "2.0.0"}}))
-    with pytest.raises(SchemaVersionError):
-        load_miss_rates(path)
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(InputFileError, match="UTF-8"):
-        load_miss_rates(path)
-
-
-def test_vision_follows_the_camera_without_being_told(health):
-    """The same empty log before and after the lens fails: only the images say so, and beta follows."""
+def test_the_query_uses_the_estimated_degradation(health):
+    """The log is empty before and after the lens fails; only the images show it, and beta follows."""
     rates = replace(synthetic_rates(), health=health)
     frames = []
     for i, frame in enumerate(street(20, seed=3, car=False)):
@@ -244,16 +209,6 @@ def test_vision_follows_the_camera_without_being_told(health):
     assert isinstance(found, Present)
     assert found.clutter_rate == pytest.approx(rates.clutter_rate(0.0), rel=0.2)
     assert doubtful.clutter_rate == pytest.approx(rates.clutter_rate(1.0), rel=0.1)
-
-
-@given(st.floats(0.0, 1.0), st.floats(0.001, 0.999))
-def test_present_and_absent_share_one_model_of_miss_and_clutter(beta, clutter):
-    """Whatever holds, the channel answers one or the other: their likelihoods sum to one."""
-    total = np.exp(Present(beta, clutter).log_likelihoods()) + np.exp(Absent(beta, clutter).log_likelihoods())
-    assert total == pytest.approx([1.0, 1.0, 1.0])
-    rng = np.random.default_rng(0)
-    found = (rng.random(4000) >= beta) | (rng.random(4000) < clutter)
-    assert np.exp(Present(beta, clutter).log_likelihoods())[1] == pytest.approx(found.mean(), abs=0.04)
 
 
 @pytest.fixture(scope="module")
@@ -279,7 +234,7 @@ def test_beta_rises_from_a_tenth_to_nine_tenths(scene, monkeypatch):
 
 
 @pytest.mark.long
-def test_a_detector_that_sees_nothing_misses_everything_and_one_that_raves_is_clutter(scene, monkeypatch):
+def test_a_blind_detector_misses_all_and_a_random_one_is_clutter(scene, monkeypatch):
     class Blind:
         def detect(self, frame):
             return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
@@ -330,14 +285,3 @@ def test_bad_input_of_the_command_is_one_line(tmp_path, capsys):
     assert main(["model", "detector", str(text), "--detector", "onnx", *out]) == 2
     assert "FILE.onnx" in capsys.readouterr().err
     assert not (tmp_path / "beta.json").exists()
-
-
-def test_health_and_degradation_refuse_what_they_cannot_be():
-    with pytest.raises(InvalidArgumentError, match="image"):
-        learn_health([], np.random.default_rng(0))
-    with pytest.raises(InvalidArgumentError):
-        CameraHealth(100.0, (1.0, 2.0, 1.0, 1.0, 1.0), (0.0,) * 5)
-    with pytest.raises(InvalidArgumentError):
-        DegradationLog(np.array([0, 0]), np.array([0.0, 0.0]))
-    with pytest.raises(InvalidArgumentError):
-        image_quality(np.zeros((4, 4), dtype=np.uint8))

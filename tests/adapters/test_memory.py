@@ -1,4 +1,4 @@
-"""Files within their limit whose content is many times as large in memory: at most 1 GB, and soon refused."""
+"""Files within their size limit that would expand in memory: at most 1 GB is used."""
 
 import json
 import subprocess
@@ -15,7 +15,7 @@ from worldstate.operations.recordings.hop_table import HopTable, load_streams, s
 
 MIB = 1 << 20
 MOST_KIB = 1_000_000_000 // 1024
-# An address space of 4 GB keeps the machine alive where a bound fails.
+# A limit of 4 GB protects the machine if a bound fails.
 MEASURE = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
@@ -45,7 +45,7 @@ def repeated(piece: str, size: int, head: str = "", tail: str = "") -> bytes:
 
 
 def json_list(piece: str, size: int, values: int | None = None) -> bytes:
-    """Return a JSON list of `size` bytes, or of so many values."""
+    """Return a JSON list of `size` bytes or of `values` values."""
     wanted = size if values is None else min(size, values // sum(map(piece.count, "[{:,")) * len(piece) - 8)
     return repeated(piece, wanted, "[", "0]")
 

@@ -1,4 +1,4 @@
-"""What a model was made for: another array or rate is refused, another order is understood."""
+"""The domain of a model: another array or rate raises an error, another channel order is accepted."""
 
 import json
 import re
@@ -81,10 +81,8 @@ RIGHT = {
 }
 
 
-def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(
-    tmp_path, monkeypatch, capsys, caplog
-) -> None:
-    """Without one, bearings alone are stated, in a program and on the command line, and how one is made."""
+def test_a_board_with_a_shipped_model_is_used_by_name(tmp_path, monkeypatch, capsys, caplog) -> None:
+    """Without a model only bearings are published, with a hint on `model make`."""
     monkeypatch.setattr(arrays, "MODELS", tmp_path)
     sound = 0.01 * np.random.default_rng(0).standard_normal((40_000, 7))
     soundfile.write(tmp_path / "own.wav", sound, 16_000)
@@ -106,7 +104,7 @@ def test_a_board_is_listened_to_by_its_name_if_a_model_ships_for_it(
 
 @pytest.mark.parametrize("name", list(arrays.named_arrays()))
 def test_a_model_ships_for_every_board_and_is_used_at_once(name: str) -> None:
-    """Its card has an exam and what simulation promises too much, and names no labelled windows."""
+    """Its card has an exam and real recordings, and lists no labelled windows."""
     board = read_array(name)
     model = read_model(array=board)
     assert model.domain is not None and (model.domain.array, model.domain.ego_motion) == (name, "standing")
@@ -121,7 +119,7 @@ def test_a_model_ships_for_every_board_and_is_used_at_once(name: str) -> None:
 
 
 def test_a_model_for_the_roof_array_ships_that_learned_no_windows_of_a_data_set() -> None:
-    """Where the licence of OVAD's windows forbids the standing model, it takes its place."""
+    """It replaces the usual model if the licence of OVAD's windows is not acceptable."""
     free, usual = read_model("simulated-56"), read_model()
     assert free.domain is not None and usual.domain is not None
     assert free.domain.ego_motion == "standing"
@@ -136,14 +134,14 @@ def test_a_model_for_the_roof_array_ships_that_learned_no_windows_of_a_data_set(
 
 @pytest.fixture
 def alone(approach: Approach, tmp_path: Path) -> Path:
-    """The sound of the session's recording as a file that no data set stands around."""
+    """Return the sound of the session's recording as a file outside of a data set."""
     path = tmp_path / "some.wav"
     path.symlink_to(approach.audio_path)
     return path
 
 
 def array_file(path: Path, positions: np.ndarray) -> Path:
-    """Write positions as a user would, by the suffix: the library's writer takes no wrong ones."""
+    """Write positions by suffix, because the writer of the library refuses wrong ones."""
     if path.suffix == ".json":
         path.write_text(json.dumps(positions.tolist()))
     elif path.suffix == ".csv":
@@ -157,7 +155,7 @@ def array_file(path: Path, positions: np.ndarray) -> Path:
 @pytest.mark.long
 @pytest.mark.parametrize(("case", "form"), list(zip(WRONG, 7 * FORMS, strict=False)))
 @pytest.mark.parametrize("beside", ["model", "data set"])
-def test_a_wrong_array_is_never_taken(
+def test_a_wrong_array_is_refused(
     case: str,
     form: str,
     beside: str,
@@ -182,15 +180,15 @@ def test_a_wrong_array_is_never_taken(
 
 
 @pytest.mark.parametrize("case", RIGHT)
-def test_the_same_places_are_taken_in_any_order_and_anywhere(case: str, alone: Path) -> None:
+def test_equal_positions_are_accepted_in_any_order_and_offset(case: str, alone: Path) -> None:
     assert open_source(alone, array=MicrophoneArray(RIGHT[case])).policy.alpha == 0.02
     AcousticAdapter(MicrophoneArray(RIGHT[case]), RATE, read_model().signature)
 
 
-def test_an_array_near_that_of_a_model_has_none_and_the_difference_is_named(
+def test_a_nearly_matching_array_has_no_model_and_a_reason(
     alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A command that needs a model refuses it; so does any, if the model is named."""
+    """Commands that need a model, or have one as an option, raise an error."""
     mics = tmp_path / "mics.xml"
     write_array_xml(mics, MicrophoneArray(HERE * [1, -1, 1]))
     assert main(["run", str(alone), "--array", str(mics)]) == 0
@@ -215,7 +213,7 @@ def test_uncalibrated_listening_states_no_budget(alone: Path) -> None:
     assert not json.loads(next(listen(alone, settings=chosen)).to_json())["calibrated"]
 
 
-def test_a_model_unfit_for_use_states_no_budget_and_keeps_saying_so(
+def test_an_unfit_model_has_no_budget_and_a_warning(
     alone: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model, path = read_model(), tmp_path / "quick.json"
@@ -225,12 +223,12 @@ def test_a_model_unfit_for_use_states_no_budget_and_keeps_saying_so(
     assert "unfit for use" in caplog.text
     assert main(["model", "show", str(path)]) == 0
     assert "unfit for use" in capsys.readouterr().out
-    # Nor is it taken for another array than its own.
+    # It is not used for another array either.
     with pytest.raises(OutOfDomainError):
         open_source(alone, model=path, array=roof_array_56())
 
 
-def test_an_ego_that_moves_is_heard_by_the_model_that_was_made_for_it(alone: Path, tmp_path: Path) -> None:
+def test_a_moving_ego_uses_the_model_for_drives(alone: Path, tmp_path: Path) -> None:
     folder = tmp_path / "DA1" / "left" / "1_05_0000"
     folder.mkdir(parents=True)
     (folder / "out_multi.wav").symlink_to(alone)
@@ -244,15 +242,15 @@ def test_an_ego_that_moves_is_heard_by_the_model_that_was_made_for_it(alone: Pat
         (open_source(alone, moving_ego=True), moving),
     ):
         assert encode(source.model) == encode(model.signature) and source.policy.alpha == 0.02
-    # One that is given stays, and states no budget where the ego does otherwise than it was made for.
+    # A given model is kept, without a budget if the ego motion does not match.
     assert open_source(folder, model=standing).policy.alpha == 0.0
     assert open_source(alone, context=stands, model=moving).policy.alpha == 0.0
 
 
 @settings(max_examples=12, deadline=None)
 @given(st.lists(st.floats(-15.0, 15.0), min_size=6, max_size=6), st.booleans())
-def test_hops_of_a_speed_that_was_not_learned_are_unheard(speeds_mps: list[float], moves: bool) -> None:
-    """By hand: the newest speed at each hop; the model for drives learned up to 30 km/h, the other none."""
+def test_hops_above_the_learned_speed_are_unheard(speeds_mps: list[float], moves: bool) -> None:
+    """Expected by the latest speed at each hop: the model for drives covers up to 30 km/h."""
     sound = np.random.default_rng(1).uniform(-0.01, 0.01, (72_000, 56)).astype(np.float32)
     listener = Listener(ovad_array(), 48_000, moving_ego=moves)
     for hop, speed_mps in enumerate(speeds_mps):
@@ -264,9 +262,7 @@ def test_hops_of_a_speed_that_was_not_learned_are_unheard(speeds_mps: list[float
     assert not [one for one, out in zip(states, outside, strict=True) if out and one.no_sequence is None]
 
 
-def test_a_drive_outside_is_named_once_and_begins_no_advisory(
-    alone: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_drive_above_the_learned_speed_warns_once(alone: Path, caplog: pytest.LogCaptureFixture) -> None:
     fast = OdometryLog((Odometry("wheels", 0, 12.0), Odometry("wheels", 1_500_000_000, 3.0)))
     states = [*listen(alone, odometry=fast)]
     told = [one for one in caplog.messages if "faster than the model learned" in one]
@@ -276,7 +272,7 @@ def test_a_drive_outside_is_named_once_and_begins_no_advisory(
     assert slow and all(one and one[0].share > 0.0 for one in slow)
 
 
-def test_a_model_of_a_file_without_a_speed_hears_every_drive() -> None:
+def test_a_model_without_a_speed_limit_accepts_every_drive() -> None:
     domain = read_model(moving_ego=True).domain
     assert domain is not None and domain.fastest_mps == pytest.approx(30.0 / 3.6)
     assert outside_of(replace(domain, fastest_mps=None), 30.0) is None
@@ -285,7 +281,7 @@ def test_a_model_of_a_file_without_a_speed_hears_every_drive() -> None:
 
 @pytest.mark.parametrize(("moves", "motion"), [(False, "standing"), (True, "moving")])
 def test_a_model_of_simulated_streets_is_of_the_ego_in_them(moves: bool, motion: str) -> None:
-    """Junctions of three renderers are named S.., T.., M..: one that stood at all of them never drove."""
+    """Junctions of the three renderers have names S.., T.. and M..; the ego motion is the same in all."""
     plan = learned_streams(CommissionSettings(junctions=2, moving_ego=moves))
     assert domain_of(ovad_array(), [6000.0], [one.site.name for one in plan]).ego_motion == motion
     both = domain_of(ovad_array(), [6000.0], ["DTA101", *(one.site.name for one in plan), "MB101"])
@@ -321,7 +317,7 @@ def test_permuted_channels_give_the_model_the_same_feature() -> None:
 
 
 def plane_wave(azimuth_deg: float) -> np.ndarray:
-    """1.2 s of noise from far away at OVAD's microphones, (n, 56)."""
+    """Return 1.2 s of a plane wave at OVAD's microphones, (n, 56)."""
     n = round(1.2 * RATE)
     spectrum = np.fft.rfft(np.random.default_rng(3).standard_normal(n))
     delays = ovad_array().delays_s(np.radians(azimuth_deg)).ravel()
@@ -341,10 +337,10 @@ def test_ovads_layout_is_read_with_ovads_array(azimuth_deg: float, tmp_path: Pat
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_another_order_is_said_and_gives_the_same_bearings(
+def test_another_channel_order_is_logged_and_gives_the_same_bearings(
     form: str, tmp_path: Path, approach: Approach, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Of a sound file the order given counts, in a data set its own."""
+    """A sound file uses the given order, a data set its own."""
     order = RNG.permutation(56)
     mics = array_file(tmp_path / f"mics.{form}", HERE[order])
     soundfile.write(tmp_path / "some.wav", plane_wave(20.0)[:, order], RATE, subtype="PCM_24")
@@ -361,7 +357,7 @@ def test_another_order_is_said_and_gives_the_same_bearings(
 def test_a_recordings_own_array_gives_the_bearings_of_the_same_one_passed(
     tmp_path: Path, approach: Approach
 ) -> None:
-    """In a data set that names its array, and in OVAD's layout, which names none."""
+    """In a data set with an array file and in OVAD's layout without one."""
     bare = tmp_path / "SA1" / "left" / "1_00_0002"
     bare.mkdir(parents=True)
     (bare / "out_multi.wav").symlink_to(approach.audio_path)
@@ -415,9 +411,7 @@ def windows(seed: int = 0) -> FeatureTable:
 
 
 @pytest.mark.long
-def test_a_table_and_the_model_trained_on_it_say_what_they_were_made_with(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_and_its_model_keep_their_array(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = MicrophoneArray(HERE[:8], "eight")
     table = replace(windows(), domain=domain_of(own, [44_100], ["SA1"]))
     write_features(tmp_path / "t.csv", table)
@@ -457,7 +451,7 @@ def test_evaluating_a_table_of_another_array_is_refused(
     save_model(model, replace(shipped, provenance=unseen))
     assert study(["windows", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 2
     assert "eight: not the array of the model" in capsys.readouterr().err
-    # A table that names none is OVAD's, as the released one.
+    # A table without an array is taken as OVAD's.
     write_features(tmp_path / "t.csv", replace(windows(), environments=np.array(["SA1"] * 60)))
     assert study(["windows", str(tmp_path / "t.csv"), "--model", str(model), *alone]) == 0
 
@@ -466,7 +460,7 @@ def test_evaluating_a_table_of_another_array_is_refused(
 def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(
     alone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Thresholds set on one array say nothing of another; streams are one signature's scores, too."""
+    """Thresholds and streams are valid for one array and one signature only."""
     shipped = read_model()
     elsewhere = MicrophoneArray(HERE * [1, -1, 1], "mirrored")
     own = replace(shipped.signature, domain=domain_of(elsewhere, [RATE], ["SA1"]))

@@ -1,4 +1,4 @@
-"""NanoDet as a plug-in: its decoder against a box by hand, and the real model where the recordings are."""
+"""NanoDet as a plug-in: its decoder against a computed box, and the real model on recordings."""
 
 import importlib.util
 import json
@@ -29,7 +29,7 @@ def nanodet():
 
 
 class OneBox:
-    """A session that finds the same in every crop: in some cell of the stride 16, with some score."""
+    """A session with one detection in every crop, in a cell of stride 16."""
 
     def __init__(self, row, column, bins, score=0.9):
         sizes = [(416 // stride) ** 2 for stride in (8, 16, 32)]
@@ -48,14 +48,14 @@ class OneBox:
 
 
 def certain(*bins):
-    """Logits under which each side lies a certain number of bins away; a half is shared by two."""
+    """Return logits with each side at a given bin; a half is shared by two bins."""
     rows = np.full((4, 8), -100.0)
     for row, value in zip(rows, bins, strict=True):
         row[[int(np.floor(value)), int(np.ceil(value))]] = 0.0
     return rows
 
 
-def test_a_box_is_where_it_is_by_hand(nanodet):
+def test_a_box_is_decoded_as_computed(nanodet):
     # The cell's middle is 16 (5, 3) + 7.5 = (87.5, 55.5); its sides are 32, 8, 16 and 48 px away. The crop
     # begins at (100, 50) and is twice the size of the input.
     session = OneBox(3, 5, certain(2, 0.5, 1, 3))
@@ -68,7 +68,7 @@ def test_a_box_is_where_it_is_by_hand(nanodet):
     np.testing.assert_allclose(session.seen[0, 0], (128 - 103.53) / 57.375, rtol=1e-5)
 
 
-def test_what_a_crop_cuts_counts_for_less_and_is_dropped_within_a_better_box(nanodet):
+def test_a_cut_box_has_a_lower_score_and_is_suppressed(nanodet):
     # In the input from 1.5 to 103.5 px: cut by the left edge of every crop but the first.
     session = OneBox(3, 5, certain(5.375, 0.5, 1, 3))
     session.logits[1][0, 3 * 26 + 5, :8] = -100.0
@@ -95,7 +95,7 @@ def test_a_model_that_is_not_there_is_named(nanodet, tmp_path):
     reason="no ovad-sequences, neither where OVAD_SEQUENCES points nor in ../shared",
 )
 def test_boxes_are_those_that_come_with_the_recordings(nanodet, monkeypatch):
-    # As `worldstate run --detector nanodet` makes it, without an argument.
+    # As `worldstate run --detector nanodet` opens it.
     monkeypatch.setenv("NANODET_ONNX", str(RECORDINGS / "detector" / "nanodet_m.onnx"))
     detector = OwnDetector.of("nanodet", nanodet.open_nanodet)
     given = json.loads((RECORDINGS / "boxes" / "1_04_0018.json").read_text())["frames"]

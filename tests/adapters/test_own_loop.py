@@ -1,4 +1,4 @@
-"""The example of a loop of one's own: own array, own detector, own signature model."""
+"""The example of a user's loop with an own array, detector and signature model."""
 
 import importlib.util
 from pathlib import Path
@@ -18,14 +18,14 @@ def own_loop():
     return module
 
 
-def test_heard_hidden_on_the_left_then_seen_with_the_same_id(own_loop):
+def test_the_example_hands_over_a_hidden_vehicle(own_loop):
     at = {state.stamp_ns / 1e9: state for state in own_loop.run()}
     assert at[1.4].entities == ()
     (hidden,), (seen,) = at[3.5].entities, at[4.5].entities
     assert (hidden.status, hidden.direction, seen.status) == ("hidden", "left", "visible")
     assert hidden.id == seen.id
     assert at[1.4].risk < 0.1 < 0.8 < at[3.5].risk
-    # What is left is another one behind it, as often as one vehicle follows another.
+    # The remaining risk is the share of vehicles that are followed by another.
     assert at[4.5].risk == pytest.approx(StreetModel().follows, abs=0.05)
     assert [cue.advisory is not None for cue in at[3.5].cues] == [True, False]
     assert seen.azimuth_rad == pytest.approx(own_loop.azimuth_at(4.5), abs=0.03)

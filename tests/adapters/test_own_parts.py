@@ -1,4 +1,4 @@
-"""Parts of one's own: the example package is installed, and its parts are named on the command line."""
+"""Plug-ins: the example package is installed and its parts are used on the command line."""
 
 import csv
 import json
@@ -24,7 +24,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "own_parts
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
-    """The example, installed where nothing else is."""
+    """Install the example into an empty folder."""
     target, tree = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("tree") / "own_parts"
     shutil.copytree(EXAMPLE, tree)
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(target)]
@@ -66,8 +66,8 @@ def test_an_exporter_gets_every_state(own_parts, log, tmp_path):
 
 
 @pytest.mark.long
-def test_a_sensor_of_ones_own_places_who_is_only_heard(own_parts, approach, tmp_path):
-    """It announces itself on the left, 20 m away, from 2 s on; what sounds comes from the right."""
+def test_an_own_sensor_gives_the_position_of_a_hidden_vehicle(own_parts, approach, tmp_path):
+    """Messages from 2 s on place it on the left, 20 m away; the sound comes from the right."""
     messages = [
         {"stamp_ns": round(time_s * 1e9), "x_m": 9.0, "y_m": 30.0 - 5.0 * time_s}
         for time_s in np.arange(2.0, 4.0, 0.1)
@@ -86,7 +86,7 @@ def test_a_sensor_of_ones_own_places_who_is_only_heard(own_parts, approach, tmp_
 
 
 @pytest.mark.long
-def test_a_detector_of_ones_own_looks_at_the_video(own_parts, approach, tmp_path):
+def test_an_own_detector_processes_the_video(own_parts, approach, tmp_path):
     folder = tmp_path / "SB1" / "right" / "3_02_0000"
     folder.mkdir(parents=True)
     (folder / "out_multi.wav").symlink_to(approach.folder / "out_multi.wav")
@@ -100,7 +100,7 @@ def test_a_detector_of_ones_own_looks_at_the_video(own_parts, approach, tmp_path
 
 
 def write_video(path, frames=100):
-    """Write a grey street through which a bright block of 300 pixels moves from frame 50 on."""
+    """Write a grey street with a bright moving block of 300 pixels from image 50 on."""
     video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (968, 304))
     for number in range(frames):
         image = np.full((304, 968, 3), 90, np.uint8)
@@ -111,7 +111,7 @@ def write_video(path, frames=100):
     video.release()
 
 
-def test_array_and_signature_of_ones_own_measure(own_parts, tmp_path):
+def test_an_own_array_and_signature_give_measurements(own_parts, tmp_path):
     array = own_parts.my_array()
     write_array_xml(tmp_path / "roof.xml", array)
     adapter = AcousticAdapter(array, 16_000, own_parts.LoudSide())
@@ -129,7 +129,7 @@ def test_array_and_signature_of_ones_own_measure(own_parts, tmp_path):
     assert measured[-1].bearing.azimuth_rad == pytest.approx(np.pi / 3, abs=0.1)
 
 
-def test_nothing_is_imported_that_was_not_named(package, log, tmp_path, monkeypatch):
+def test_only_selected_plug_ins_are_imported(package, log, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(package)
     monkeypatch.delitem(sys.modules, "own_parts", raising=False)
     assert main(["log", "replay", str(log), "--export", f"autoware={tmp_path / 'a.jsonl'}"]) == 0
@@ -137,9 +137,7 @@ def test_nothing_is_imported_that_was_not_named(package, log, tmp_path, monkeypa
     assert installed("worldstate.exporters") == ["table"]
 
 
-def test_a_name_that_nobody_brings_is_refused_with_those_that_are_there(
-    own_parts, log, approach, tmp_path, capsys
-):
+def test_an_unknown_plug_in_is_refused_with_the_known_ones(own_parts, log, approach, tmp_path, capsys):
     replay, run = ["log", "replay", str(log)], ["run", str(approach.folder)]
     for name in ("radar", "v2x"):
         (tmp_path / f"{name}.json").write_text(json.dumps({"measurements": {name: "none.jsonl"}}))
@@ -157,7 +155,7 @@ def test_a_name_that_nobody_brings_is_refused_with_those_that_are_there(
         assert said in " ".join(capsys.readouterr().err.split()), options
 
 
-def test_a_part_that_cannot_be_used_is_told_from_one_that_is_not_there(log, tmp_path, monkeypatch, capsys):
+def test_a_broken_plug_in_has_its_own_error(log, tmp_path, monkeypatch, capsys):
     for name, text in (("broken", "raise RuntimeError('no licence')"), ("number", "export = 7")):
         (tmp_path / f"{name}.py").write_text(text)
         info = tmp_path / f"{name}-1.0.dist-info"
@@ -187,7 +185,7 @@ def at_a_state(target):
 
 
 @pytest.mark.parametrize("name", ["at_once", "at_a_state"])
-def test_a_part_that_ends_the_program_is_an_error_with_its_name(name, log, tmp_path, monkeypatch, capsys):
+def test_a_plug_in_that_exits_is_an_error(name, log, tmp_path, monkeypatch, capsys):
     (tmp_path / "raising.py").write_text(RAISING)
     info = tmp_path / "raising-1.0.dist-info"
     info.mkdir()
@@ -200,7 +198,7 @@ def test_a_part_that_ends_the_program_is_an_error_with_its_name(name, log, tmp_p
 
 
 @pytest.mark.parametrize("error", [SystemExit(0), BaseException("odd"), RuntimeError("no licence")])
-def test_a_detector_that_raises_anything_ends_the_run_with_its_name(error):
+def test_a_detector_that_raises_ends_the_run_with_its_name(error):
     class Raising:
         def detect(self, frame):
             raise error
@@ -212,6 +210,6 @@ def test_a_detector_that_raises_anything_ends_the_run_with_its_name(error):
         looks.deliver(lambda *look: None)
 
 
-def test_a_signal_that_comes_while_a_part_works_is_none_of_its_errors():
+def test_a_signal_during_a_plug_in_is_not_its_error():
     with pytest.raises(SystemExit), of_part("mine"):
         raise SystemExit(128 + 15)

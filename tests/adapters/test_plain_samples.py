@@ -1,4 +1,4 @@
-"""Sizes, containers and encodings that contradict the samples: all that was recorded is read, or refused."""
+"""Headers that contradict the samples: all samples are read, or an error is raised."""
 
 import io
 import logging
@@ -27,14 +27,14 @@ def noise(frames: int = 9001, channels: int = 3, scale: float = 0.1) -> np.ndarr
 
 
 def size_at(data: bytes, container: str) -> tuple[int, str]:
-    """Return where the size of the samples stands in a header, and how it is packed."""
+    """Return the offset and the format of the size of the samples in a header."""
     if container in ("RF64", "BW64"):
         return data.index(b"ds64") + 16, "<Q"
     return data.index(b"data") + (16 if container == "W64" else 4), "<Q" if container == "W64" else "<I"
 
 
 def with_size(path: Path, container: str, size: int, subtype: str = "PCM_16", tail: bytes = b"") -> Path:
-    """Write a file whose header says another size, and perhaps chunks behind the samples."""
+    """Write a file with another size in its header and optional chunks after the samples."""
     kind = {"BW64": "RF64"}.get(container, container)
     soundfile.write(path, noise(), RATE_HZ, format=kind, subtype=subtype)
     data = bytearray(path.read_bytes() + tail)
@@ -52,7 +52,7 @@ def heard(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24", "FLOAT"])
 @pytest.mark.parametrize("container", ["WAV", "WAVEX", "RF64", "BW64", "W64"])
-def test_of_a_recorder_that_was_killed_all_samples_are_read_and_it_is_said(
+def test_a_file_with_an_open_size_is_read_with_a_warning(
     tmp_path: Path, container: str, subtype: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     for size in OPEN_SIZES if container.startswith("WAV") else (0, *OPEN_SIZES[1:5], 2**64 - 1):
@@ -70,7 +70,7 @@ def test_of_a_recorder_that_was_killed_all_samples_are_read_and_it_is_said(
     container=st.sampled_from(["WAV", "RF64", "BW64"]),
 )
 @settings(max_examples=40, deadline=None)
-def test_no_size_costs_a_sample_in_silence(
+def test_a_wrong_size_never_drops_samples_silently(
     tmp_path_factory: pytest.TempPathFactory, share: float, more: int, container: str
 ) -> None:
     path, there = tmp_path_factory.mktemp("size") / "a.wav", 9001 * 6
@@ -85,7 +85,7 @@ CHUNK = b"LIST" + struct.pack("<I", 10) + b"INFOISFTab"
 
 @pytest.mark.parametrize("tail", [b"", CHUNK, CHUNK + b"id3 " + struct.pack("<I", 3) + b"abc\0", b"\0"])
 @pytest.mark.parametrize("container", ["WAV", "RF64"])
-def test_chunks_behind_the_samples_are_no_samples(
+def test_chunks_after_the_samples_are_ignored(
     tmp_path: Path, container: str, tail: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     np.testing.assert_allclose(
@@ -95,10 +95,10 @@ def test_chunks_behind_the_samples_are_no_samples(
 
 
 @pytest.mark.parametrize("tail", [b"", CHUNK])
-def test_a_size_that_has_wrapped_round_is_counted_on(
+def test_a_size_beyond_32_bits_is_recovered(
     tmp_path: Path, tail: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Eight thousand samples, 4 GiB of nothing that no disk holds, and one more sample."""
+    """A sparse file: 8,000 samples, a hole of 4 GiB and one more sample."""
     name, frame = tmp_path / "long.wav", 6
     frames = (2**32 + 48_000) // frame
     soundfile.write(name, noise(), RATE_HZ, subtype="PCM_16")
@@ -115,7 +115,7 @@ def test_a_size_that_has_wrapped_round_is_counted_on(
 
 
 def stored(samples: np.ndarray, encoding: Encoding) -> bytes:
-    """Return samples as a converter gives them, written here by NumPy alone."""
+    """Return the bytes of samples in an encoding, by NumPy."""
     if encoding == "f32":
         return samples.astype("<f4").tobytes()
     bits = int(encoding[1:3])
@@ -126,7 +126,7 @@ def stored(samples: np.ndarray, encoding: Encoding) -> bytes:
 
 
 def wav_of_24_bits(path: Path, data: bytes, channels: int, tag: int = 1) -> Path:
-    """Write 24 bits in four bytes each, as arecord and as the standard have them."""
+    """Write 24 bits in four bytes each, as arecord does and as the standard requires."""
     about = struct.pack("<HHIIHH", tag, channels, RATE_HZ, RATE_HZ * 4 * channels, 4 * channels, 24)
     if tag != 1:
         about += struct.pack("<HHIH", 22, 24, 0, 1) + b"\0\0\0\0\x10\0\x80\0\0\xaa\0\x38\x9b\x71"
@@ -137,7 +137,7 @@ def wav_of_24_bits(path: Path, data: bytes, channels: int, tag: int = 1) -> Path
 
 @pytest.mark.parametrize("tag", [1, 0xFFFE])
 @pytest.mark.parametrize("upper", ["sign", "zero", "full scale"])
-def test_24_bits_in_four_bytes_of_a_file_have_their_level(tmp_path: Path, upper: str, tag: int) -> None:
+def test_24_bits_in_four_bytes_keep_their_level(tmp_path: Path, upper: str, tag: int) -> None:
     whole = np.frombuffer(stored(noise(), "s24_32"), "<i4")
     data = {"sign": whole, "zero": whole & 0xFFFFFF, "full scale": whole << 8}[upper]
     found = heard(wav_of_24_bits(tmp_path / "a.wav", data.astype("<i4").tobytes(), 3, tag))
@@ -147,7 +147,7 @@ def test_24_bits_in_four_bytes_of_a_file_have_their_level(tmp_path: Path, upper:
 @pytest.mark.parametrize("encoding", SUBTYPES)
 @given(scale=st.floats(1e-3, 0.3), channels=st.integers(1, 9))
 @settings(max_examples=15, deadline=None)
-def test_every_encoding_is_read_as_itself(encoding: Encoding, scale: float, channels: int) -> None:
+def test_every_encoding_is_decoded(encoding: Encoding, scale: float, channels: int) -> None:
     samples = noise(9000, channels, scale)
     data = stored(samples, encoding)
     np.testing.assert_allclose(decoded(data, SUBTYPES[encoding], channels), samples, atol=5e-5)
@@ -160,7 +160,7 @@ def test_every_encoding_is_read_as_itself(encoding: Encoding, scale: float, chan
 @pytest.mark.parametrize("encoding", ["s24_32", "f32", "s32"])
 @given(scale=st.floats(1e-3, 0.3), channels=st.sampled_from([1, 2, 4, 6, 7, 8, 16]))
 @settings(max_examples=8, deadline=None)
-def test_four_bytes_a_sample_are_never_heard_as_three(
+def test_samples_of_four_bytes_are_not_read_as_three(
     encoding: Encoding, read_as: Encoding, scale: float, channels: int
 ) -> None:
     data = stored(noise(12_000, channels, scale), encoding)
@@ -175,7 +175,7 @@ def test_four_bytes_a_sample_are_never_heard_as_three(
         open_sound(raw)
 
 
-def test_a_quiet_recording_of_32_bits_is_read_and_doubted(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_quiet_32_bit_recording_logs_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     quiet = stored(noise(9000, 4, 5e-4), "s32")
     with caplog.at_level(logging.WARNING), open_sound(RawPcm(io.BytesIO(quiet), RATE_HZ, 4, "s32")) as audio:
         assert audio.silent_channels == ()
@@ -183,7 +183,7 @@ def test_a_quiet_recording_of_32_bits_is_read_and_doubted(caplog: pytest.LogCapt
 
 
 def street_sound(frames: int, channels: int, scale: float, dead: int) -> np.ndarray:
-    """Sound with less at high frequencies, 40 dB above the noise of its channels; one may be hardly used."""
+    """Return red sound 40 dB above the noise of its channels; one channel may be almost dead."""
     steps = np.random.default_rng(3).normal(0.0, 1.0, (frames, channels))
     sound = lfilter([1.0], [1.0, -0.95], steps, axis=0)
     sound = scale * (sound / sound.std() + 0.01 * steps)
@@ -203,7 +203,7 @@ FORMS: tuple[str, ...] = (*SUBTYPES, "s16, big-endian")
     dead=st.sampled_from([0, 3, 99]),
 )
 @settings(max_examples=8, deadline=None)
-def test_sound_of_one_form_is_heard_as_no_other(
+def test_sound_of_one_encoding_is_refused_as_another(
     encoding: str, read_as: Encoding, scale: float, channels: int, dead: int
 ) -> None:
     form = cast("Encoding", encoding.partition(",")[0])
@@ -228,7 +228,7 @@ def test_a_file_on_standard_input_is_no_raw_sound(tmp_path: Path, kind: str) -> 
 
 
 @pytest.mark.parametrize("held", ["floats", "whole numbers"])
-def test_a_header_that_names_another_form_is_refused(tmp_path: Path, held: str) -> None:
+def test_a_header_with_another_encoding_is_refused(tmp_path: Path, held: str) -> None:
     samples = noise(9000, 3)
     data = stored(samples, "f32" if held == "floats" else "s32")
     path = wav_of_24_bits(tmp_path / "a.wav", data, 3)
@@ -240,7 +240,7 @@ def test_a_header_that_names_another_form_is_refused(tmp_path: Path, held: str) 
 
 
 @pytest.mark.parametrize(("scale", "said"), [(1.0, False), (3.0, False), (32_768.0, True), (2.0**31, True)])
-def test_floats_with_the_scale_of_whole_numbers_draw_a_line(
+def test_floats_beyond_full_scale_log_a_warning(
     tmp_path: Path, scale: float, said: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     soundfile.write(tmp_path / "a.wav", noise() * scale, RATE_HZ, subtype="DOUBLE")
@@ -260,7 +260,7 @@ NAMES = {
     "pattern", ["mic_{}.wav", "ch{}.wav", "2024-05-01 street {} left.wav", "m{}/rec.wav"]
 )
 @pytest.mark.parametrize("case", NAMES)
-def test_numbered_files_are_taken_by_number_or_it_is_said(
+def test_numbered_files_are_ordered_by_number_or_log_a_warning(
     tmp_path: Path, case: str, pattern: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     numbers, by_number = NAMES[case]
@@ -280,7 +280,7 @@ def test_numbered_files_are_taken_by_number_or_it_is_said(
     ("name", "way"),
     [("a.bag", "rosbags-convert"), ("a.raw", "pcm:RATE"), ("a.au", "`sox a.au out.wav`"), ("a.mp3", "`sox")],
 )
-def test_another_form_of_sound_is_refused_with_the_way_on(tmp_path: Path, name: str, way: str) -> None:
+def test_other_sound_formats_are_refused_with_a_remedy(tmp_path: Path, name: str, way: str) -> None:
     (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n" + bytes(1000))
     if name == "a.au":
         soundfile.write(tmp_path / name, noise(), RATE_HZ)

@@ -1,4 +1,4 @@
-"""Sound that is pushed is heard as `run` hears it, whatever the blocks, and gone on with at any sample."""
+"""Pushed sound gives the states of `run` for any blocks, and continues from a checkpoint at any sample."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,13 +29,13 @@ TRUCK = DetectionFrame(np.array([[300.0, 200.0, 380.0, 260.0]]), np.array([0.9])
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    """The one that ships, as if made of three microphones: any windows will do."""
+    """Return the shipped model with a domain of three microphones."""
     shipped = read_model()
     return replace(shipped, signature=replace(shipped.signature, domain=domain_of(ARRAY, [6000], ["SA1"])))
 
 
 def looked(listener: Listener, start: int, end: int) -> None:
-    """Show the images that are taken in these samples; at 0.5 s the camera calls something a truck."""
+    """Push the images of these samples; the one at 0.5 s shows a truck."""
     for number in range(30):
         if start <= number * RATE_HZ // 10 < end:
             listener.look(nanoseconds(number / 10), TRUCK if number == 5 else CAR)
@@ -55,7 +55,9 @@ def in_one(model: Model) -> list[str]:
 @pytest.mark.long
 @settings(max_examples=8)
 @given(cut=st.integers(0, len(SOUND)))
-def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Model, in_one: list[str]) -> None:
+def test_another_listener_continues_at_any_sample_bit_for_bit(
+    cut: int, model: Model, in_one: list[str]
+) -> None:
     first = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad())
     states = pushed(first, 0, cut)
     kept = first.checkpoint()
@@ -66,23 +68,23 @@ def test_another_listener_goes_on_at_any_sample_to_the_bit(cut: int, model: Mode
         assert states + rest == in_one
 
 
-def test_after_a_loss_that_is_skipped_its_window_is_told_and_the_time_is_right(model: Model) -> None:
+def test_a_skipped_loss_keeps_the_time_and_is_reported(model: Model) -> None:
     silence = np.zeros((round(0.9 * RATE_HZ), 3), np.float32)
     listener = Listener(ARRAY, RATE_HZ, model=model)
     listener.push(np.concatenate([SOUND, silence]))
     listener.skip(4 * 10**9)
     told = {one.stamp_ns: one.heard[0] for one in listener.push(SOUND)}
-    # The last hop of the silence waits in the resampler for what follows.
+    # The last hop of the silence stays in the resampler.
     assert list(told) == [nanoseconds(7.9 + 0.1 * hop) for hop in range(30)]
     lost_s = [stamp_ns / 1e9 for stamp_ns, heard in told.items() if heard.reason == "lost samples"]
-    # As of a second of silence: in one window.
+    # The loss affects one window of one second.
     assert 0.8 <= max(lost_s) - min(told) / 1e9 <= 1.0
     assert list(told.values())[-1].share == 1.0
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("size", [1, 37, 480, 48_000])
-def test_states_are_those_of_run_for_blocks_of_any_size(
+def test_pushed_states_equal_run_for_any_block_size(
     size: int, tmp_path: Path, model: Model, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from worldstate.adapters.files.array_file import write_array_xml
@@ -100,7 +102,7 @@ def test_states_are_those_of_run_for_blocks_of_any_size(
 
 
 @pytest.mark.long
-def test_the_demo_s_recording_is_pushed_as_run_hears_it(approach, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_the_pushed_demo_recording_equals_run(approach, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "states.jsonl"
     assert main(["run", str(approach.audio_path), "--out", str(out)]) == 0
     with soundfile.SoundFile(approach.audio_path) as sound:
@@ -109,7 +111,7 @@ def test_the_demo_s_recording_is_pushed_as_run_hears_it(approach, tmp_path: Path
     assert [state.to_json() for state in [*states, *listener.push(None)]] == out.read_text().splitlines()
 
 
-def test_a_checkpoint_of_a_file_goes_on_from_a_second_before_it(tmp_path: Path, model: Model) -> None:
+def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path, model: Model) -> None:
     told = [Odometry("wheels", nanoseconds(at), 0.0) for at in (0.4, 1.4, 2.4)]
     whole = Listener(ARRAY, RATE_HZ, model=model)
     whole.add(*told)
@@ -123,7 +125,7 @@ def test_a_checkpoint_of_a_file_goes_on_from_a_second_before_it(tmp_path: Path, 
     assert read_checkpoint(tmp_path / "now.json").senses is None
 
 
-def test_a_checkpoint_is_refused_by_other_ears(model: Model) -> None:
+def test_a_checkpoint_of_another_array_or_rate_is_refused(model: Model) -> None:
     kept: Checkpoint = Listener(ARRAY, RATE_HZ, model=model).checkpoint()
     moved = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.2, 0.0]])
     anything = ListenSettings(uncalibrated=True)

@@ -1,4 +1,4 @@
-"""A model file with a sequence, from sound to snapshot: as streams on disk say it, across a checkpoint."""
+"""A model file with a sequence, from sound to snapshot, compared with streams on disk."""
 
 import json
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "t
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three seconds of noise that swells, and a made-up model of it with a sequence."""
+    """Write three seconds of modulated noise and a random model with a sequence."""
     place, rng = tmp_path_factory.mktemp("sequence"), np.random.default_rng(0)
     swelling = 0.01 * np.exp(np.sin(np.arange(3 * RATE_HZ) / RATE_HZ))[:, None]
     sound = rng.standard_normal((3 * RATE_HZ, 3)).cumsum(axis=1)
@@ -85,7 +85,7 @@ def test_states_are_the_same_to_the_bit_for_blocks_of_any_length(
     assert [state.to_json() for state in states] == [step.state.to_json() for step in whole]
 
 
-def test_what_is_told_counts_from_its_stamp_on_and_a_checkpoint_is_gone_on_from(folder: Path) -> None:
+def test_measurements_take_effect_at_their_stamp_across_a_checkpoint(folder: Path) -> None:
     sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
     told = [Odometry("wheels", 10**8 * tenth, 2.0) for tenth in (2, 13, 14, 25)]
     source = open_source(folder / "sound.wav", model=folder / "model.json", others=[lambda: told])
@@ -102,7 +102,7 @@ def test_what_is_told_counts_from_its_stamp_on_and_a_checkpoint_is_gone_on_from(
     assert speeds == [2.0] * len(states)
 
 
-def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path, whole: list[Step]) -> None:
+def test_a_running_chain_equals_a_stream_on_disk(folder: Path, whole: list[Step]) -> None:
     heard, model = whole, read_model(folder / "model.json")
     frames = [step.frame for step in heard]
     looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
@@ -124,14 +124,7 @@ def test_a_running_chain_reads_what_a_stream_on_disk_does(folder: Path, whole: l
     assert len(frames[0].band_log_energy) == 16 and LEVEL_BAND_HZ[1] == 0.45 * RATE_HZ
 
 
-def test_a_recording_heard_in_parts_gives_the_states_of_the_whole(folder: Path, whole: list[Step]) -> None:
-    cut = whole[12]
-    save_checkpoint(folder / "half.json", cut.checkpoint)
-    rest = steps(folder, resume=read_checkpoint(folder / "half.json"))
-    assert [one.state.to_json() for one in rest] == [one.state.to_json() for one in whole[13:]]
-
-
-def test_the_snapshot_has_the_shares_of_the_card_where_its_exam_holds(folder: Path) -> None:
+def test_the_snapshot_has_the_shares_of_the_exam_within_its_domain(folder: Path) -> None:
     model = read_model(folder / "model.json")
     card = replace(model.provenance, kinds=(KindShare("bicycle", 0.08, 12), KindShare("car", 0.78, 49)))
     known = replace(model, provenance=card)
@@ -146,7 +139,7 @@ def test_the_snapshot_has_the_shares_of_the_card_where_its_exam_holds(folder: Pa
     assert heard(settings=anywhere).kinds is heard(context=Context(ego_speed_mps=5.0)).kinds is None
 
 
-def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path) -> None:
+def test_outside_of_its_domain_a_sequence_has_a_reason(folder: Path) -> None:
     moving = next(steps(folder, context=Context(ego_speed_mps=5.0))).state
     assert moving.no_sequence == NotUsable("the model was made for a standing ego, this one is moving")
     model = read_model(folder / "model.json")
@@ -167,16 +160,16 @@ def test_where_the_model_was_not_made_for_it_the_snapshot_says_why(folder: Path)
     assert {cue.within for cue in (*moving.cues, *free.cues, *quick.cues)} == {None}
 
 
-def test_foreign_sounds_say_as_little_of_each_side_as_of_both() -> None:
+def test_foreign_sounds_lose_evidence_of_each_side() -> None:
     sides = SideEvidence(("left", "right"), (3.0, -1.0), 0.1, 0.1, 0.5)
     heard = neutral(SignatureEvidence(("left", "right"), (3.0, -1.0), -2.0, 0.5, sides), margin=2.0)
     assert heard.sides == replace(sides, log_ratios=(1.0, 0.0))
 
 
 def lossy(folder: Path, tmp_path: Path, seconds: float) -> tuple[list[Step], list[Step]]:
-    """Hear eight seconds of noise, with so much of it lost after three, and without a loss."""
+    """Process eight seconds of noise with and without a loss after three seconds."""
     rng = np.random.default_rng(5)
-    # A wave from ahead, so that no microphone looks like a faulty one.
+    # A wave from ahead, so that no microphone seems faulty.
     sound = 0.01 * (rng.standard_normal((8 * RATE_HZ, 1)) + 0.3 * rng.standard_normal((8 * RATE_HZ, 3)))
     heard = []
     for name, lost in (("lossy.wav", round(seconds * RATE_HZ)), ("whole.wav", 0)):
@@ -189,11 +182,11 @@ def lossy(folder: Path, tmp_path: Path, seconds: float) -> tuple[list[Step], lis
 
 
 @pytest.mark.long
-def test_lost_sound_is_no_evidence_and_leaves_nothing_behind(folder: Path, tmp_path: Path) -> None:
+def test_lost_sound_is_no_evidence_and_has_no_later_effect(folder: Path, tmp_path: Path) -> None:
     hurt, whole = lossy(folder, tmp_path, 1.0)
     measured = {round(step.state.stamp_ns / 1e9, 1): step.measurement for step in hurt}
     unheard = [at for at, one in measured.items() if not one.heard.usable]
-    # From the first lost hop until four tenths of the window are sound again.
+    # From the first lost hop until 40 % of the window is usable again.
     assert unheard == [round(3.1 + 0.1 * k, 1) for k in range(13)]
     refused = NotUsable("lost samples")
     for at in unheard:
@@ -208,15 +201,13 @@ def test_lost_sound_is_no_evidence_and_leaves_nothing_behind(folder: Path, tmp_p
     assert ends[0].site.heard_s == pytest.approx(ends[1].site.heard_s - 1.3, abs=0.05)
     assert ends[0].history is not None and ends[1].history is not None
     assert len(ends[0].history.minute) == len(ends[1].history.minute) - 13
-    # Level, loudness and prominence of the last hops are as if nothing had been lost.
+    # Level, loudness and prominence of the last hops equal those without a loss.
     recent = [end.history.recent[1 - RECENT_HOPS :, 3:6] for end in ends if end.history is not None]
     np.testing.assert_allclose(recent[0], recent[1], atol=1e-9)
 
 
 @pytest.mark.long
-def test_the_seconds_before_a_short_loss_join_on_and_those_before_a_long_one_are_forgotten(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_history_survives_a_short_loss_only(folder: Path, tmp_path: Path) -> None:
     for seconds, first in ((1.0, ""), (4.0, "less than 10 hops of evidence")):
         hurt, _ = lossy(folder, tmp_path, seconds)
         said = [step.measurement.sequence for step in hurt]
@@ -225,7 +216,7 @@ def test_the_seconds_before_a_short_loss_join_on_and_those_before_a_long_one_are
 
 
 @pytest.mark.long
-def test_a_checkpoint_within_a_loss_goes_on_as_the_whole(folder: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_within_a_loss_continues(folder: Path, tmp_path: Path) -> None:
     hurt, _ = lossy(folder, tmp_path, 1.0)
     cut = hurt[25]
     save_checkpoint(tmp_path / "half.json", cut.checkpoint)
@@ -235,7 +226,7 @@ def test_a_checkpoint_within_a_loss_goes_on_as_the_whole(folder: Path, tmp_path:
     assert [one.state.to_json() for one in listen_steps(source)] == [one.state.to_json() for one in hurt[26:]]
 
 
-def test_a_model_that_states_no_times_says_so(folder: Path) -> None:
+def test_a_model_without_a_sequence_has_a_reason(folder: Path) -> None:
     plain = replace(read_model(folder / "model.json"), sequence=None)
     state = next(listen_steps(open_source(folder / "sound.wav", model=plain))).state
     assert state.no_sequence is not None and "model make" in state.no_sequence.reason
@@ -243,7 +234,7 @@ def test_a_model_that_states_no_times_says_so(folder: Path) -> None:
 
 
 def curved(folder: Path) -> Model:
-    """Return the model with a curve of budgets whose thresholds lie among the log-odds of its sound."""
+    """Return the model with an alarm curve whose thresholds span the log-odds of its sound."""
     model = read_model(folder / "model.json")
     silent = replace(model.sequence, alarm=SequenceAlarm(1e6, 15.0))
     heard = [
@@ -264,7 +255,7 @@ def advised(folder: Path, model: Model, **asked: float) -> tuple[int, WorldState
     return sum(cue.advisory is not None for state in states for cue in state.cues), states[-1]
 
 
-def test_what_is_asked_sets_the_threshold_and_the_snapshot_states_what_the_curve_promises(
+def test_a_requested_budget_sets_threshold_and_promise(
     folder: Path,
 ) -> None:
     model = curved(folder)
@@ -286,7 +277,7 @@ def test_what_is_asked_sets_the_threshold_and_the_snapshot_states_what_the_curve
     assert sum(cue.advisory is not None for state in listener.push(sound) for cue in state.cues) == many
 
 
-def test_what_no_curve_supports_is_refused_with_what_is_known(folder: Path) -> None:
+def test_an_unsupported_budget_is_refused_with_the_range(folder: Path) -> None:
     model, only = curved(folder), read_model(folder / "model.json")
     plain = replace(only, sequence=None)
     assert advised(folder, only, budget=15.0)[1].budget.onsets_per_hour == 15.0  # type: ignore[union-attr]
@@ -304,9 +295,7 @@ def test_what_no_curve_supports_is_refused_with_what_is_known(folder: Path) -> N
     assert open_source(folder / "sound.wav", model=plain, alpha=0.05).policy.alpha == 0.05
 
 
-def test_a_model_file_keeps_its_curve_and_one_without_is_read_with_its_single_alarm(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_model_file_keeps_its_curve_or_single_alarm(folder: Path, tmp_path: Path) -> None:
     model = curved(folder)
     save_model(tmp_path / "curve.json", model)
     kept = read_model(tmp_path / "curve.json")

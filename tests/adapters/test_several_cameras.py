@@ -1,4 +1,4 @@
-"""Several cameras as one channel: the miss rate of all together, against a fine sum over azimuths."""
+"""Several cameras as one channel: the joint miss rate against a sum over azimuths."""
 
 import math
 
@@ -24,7 +24,7 @@ def camera(yaw_deg, half_deg=45.0, frame=EMPTY):
 
 
 def fine_miss_rate(cameras, centre_rad, half_rad):
-    """Return the mean over a fine grid of what every camera that sees an azimuth misses there."""
+    """Return the mean over a fine grid of the product of the miss rates."""
     grid = centre_rad + half_rad * (2.0 * np.arange(4000) + 1.0 - 4000) / 4000
     missed = np.ones_like(grid)
     for one in cameras:
@@ -36,7 +36,7 @@ def fine_miss_rate(cameras, centre_rad, half_rad):
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(-120, 120), min_size=2, max_size=4), st.floats(-1.2, 1.2))
-def test_what_all_miss_is_the_mean_over_azimuths_of_what_each_misses(yaws_deg, azimuth_rad):
+def test_the_joint_miss_rate_is_the_mean_over_azimuths(yaws_deg, azimuth_rad):
     cameras = [camera(yaw) for yaw in yaws_deg]
     asked = SeveralCameras({str(i): one for i, one in enumerate(cameras)})
     said = asked.ask(NOW, Bearing(azimuth_rad, 0.05))
@@ -52,11 +52,11 @@ def test_a_side_that_two_cameras_share_is_searched_by_both():
     both = SeveralCameras({"front": front, "left": left})
     alone = [one.ask(NOW, COARSE, None, "left").miss_rate for one in (front, left)]
     assert both.ask(NOW, COARSE, None, "left").miss_rate < 0.5 * min(alone)
-    # The left camera sees nothing of the right side.
+    # The right side is outside the view of the left camera.
     assert both.ask(NOW, COARSE, None, "right") == front.ask(NOW, COARSE, None, "right")
 
 
-def test_what_one_of_them_finds_is_present_and_named():
+def test_a_detection_of_one_camera_is_present():
     both = SeveralCameras({"front": camera(0.0), "left": camera(60.0, frame=CAR)})
     assert isinstance(both.ask(NOW, Bearing(1.05, 0.05)), Present)
     looks = both.looks(NOW)
@@ -65,7 +65,7 @@ def test_what_one_of_them_finds_is_present_and_named():
     assert looks[1].sightings[0].azimuth_rad == pytest.approx(math.radians(60.0))
 
 
-def test_a_camera_without_an_image_leaves_the_others_to_look():
+def test_a_camera_without_an_image_does_not_block_others():
     blind = VisionQuery(PinholeCamera.ovad(), DetectionLog((EMPTY,), np.array([0])))
     both = SeveralCameras({"front": blind, "left": camera(60.0, frame=CAR)})
     assert both.last_look(NOW).sensor == "left" and len(both.sightings(NOW)) == 1

@@ -1,12 +1,10 @@
-"""The site learned by the running chain: switched, checkpointed, harmless on mostly empty streets."""
+"""Learning of a site in the running chain: option, checkpoints and effect on mostly empty streets."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Absent
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
@@ -21,7 +19,7 @@ from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoin
 from worldstate.adapters.listener import listen_steps, measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.core.filter import WorldFilter
-from worldstate.ground.errors import InputFileError, InvalidArgumentError, SchemaVersionError
+from worldstate.ground.errors import InvalidArgumentError
 
 CLASSES = ("front", "left", "none", "right")
 AZIMUTH = np.tile(np.linspace(-1, 1, 30), 2)
@@ -29,7 +27,7 @@ SHAPES = {"front": 1 + AZIMUTH**2, "none": 0 * AZIMUTH, "left": 0.7 - AZIMUTH, "
 
 
 def windows(rng, labels, site=0.0, spread=0.7):
-    """Log-levels at a site whose street adds `site`; the louder of street and vehicle is heard."""
+    """Return log-levels of vehicles and a street of level `site`; the louder one dominates."""
     vehicle = np.stack([SHAPES[label] for label in labels])
     return np.logaddexp(site, vehicle) + spread * rng.normal(size=vehicle.shape)
 
@@ -71,17 +69,15 @@ def test_the_switch(approach, model):
     assert replace(on, model=published).signature() is published
 
 
-def test_every_pass_over_a_source_learns_anew(heard):
+def test_every_pass_over_a_source_starts_without_a_site(heard):
     source, frames = heard
     first, second = source.signature(), source.signature()
     first.evidence(frames[0].feature)
     assert second.estimate.heard_s == 0.0
 
 
-def test_the_forgetting_time_is_handed_on(approach):
+def test_the_forgetting_time_reaches_the_estimate(approach):
     assert ListenSettings(forgetting_s=7.0).site() == SiteEstimateSettings(7.0)
-    with pytest.raises(InvalidArgumentError, match="forgetting_s"):
-        ListenSettings(forgetting_s=0.0)
 
 
 @pytest.mark.long
@@ -110,7 +106,7 @@ def test_a_checkpoint_of_the_chain_continues_bit_for_bit(heard, cut, tmp_path):
     assert len(whole) == len(expected)
 
 
-def test_a_site_known_beforehand_is_taken_up(heard):
+def test_a_known_site_is_used(heard):
     source, window = heard[0], np.exp(heard[0].model.empty)
     louder = SiteEstimate(source.model.empty + AZIMUTH, heard_s=300.0)
     before = Checkpoint(source.world(), louder)
@@ -123,40 +119,8 @@ def test_a_filter_s_own_checkpoint_reads_as_one_without_a_site():
     assert Checkpoint.from_dict(WorldFilter().to_dict()).site is None
 
 
-def test_another_major_version_is_named_with_its_file(tmp_path):
-    schema = {"name": "worldstate.Filter", "version": "9.0.0"}
-    value = Checkpoint(WorldFilter()).to_dict() | {"schema": schema}
-    (tmp_path / "c.json").write_text(json.dumps(value))
-    with pytest.raises(SchemaVersionError, match=r"c\.json"):
-        read_checkpoint(tmp_path / "c.json")
-
-
-@settings(max_examples=60, deadline=None)
-@given(data=st.data())
-def test_damaged_checkpoints_are_refused_by_name(tmp_path_factory, data):
-    path = tmp_path_factory.mktemp("fuzz") / "c.json"
-    value = Checkpoint(WorldFilter(), SiteEstimate.start(4)).to_dict()
-    at = value["site"]
-    wrong = st.sampled_from([True, "text", [], {}, [None], -1.5, 10**400, "1.0", ["1.0"]])
-    kind = data.draw(st.sampled_from(["level", "heard_s", "site", "truncated", "bytes", "missing"]))
-    if kind == "site":
-        value["site"] = data.draw(wrong)
-    elif kind in at:
-        at[kind] = data.draw(wrong)
-    text = json.dumps(value).encode()
-    if kind == "truncated":
-        text = text[: data.draw(st.integers(0, len(text) - 2))]
-    path.write_bytes(b"\xff\xfe" if kind == "bytes" else text)
-    if kind == "missing":
-        path.unlink()
-    if kind == "level" and at["level"] == []:
-        return  # No feature at all: an estimate that no model takes.
-    with pytest.raises(InputFileError, match=r"c\.json"):
-        read_checkpoint(path)
-
-
 def decided(model, gamma, stream):
-    """Decisions on a stream, site learned and not; the first is asked as the chain asks it."""
+    """Return decisions on a stream with and without the learned site."""
     signature = SiteSignature(model)
     pairs = [(signature.evidence(window), model.evidence(window)) for window in stream]
     answer, prior = Absent(0.0), model.reference_prior
@@ -165,7 +129,7 @@ def decided(model, gamma, stream):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_on_streams_of_mostly_empty_street_no_hit_is_lost(model, monkeypatch):
+def test_learning_on_mostly_empty_streets_loses_no_detections(model, monkeypatch):
     monkeypatch.setattr(site_estimate, "HOP_S", 1.0)  # Windows that do not overlap
     rng = np.random.default_rng(100)
     X, y = made_up_sites(rng)

@@ -1,4 +1,4 @@
-"""The vision query: three answers, an honest miss rate, and the mirrored world mirrored."""
+"""The vision query: its answers, its miss rate and mirror symmetry."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,7 @@ def frame(*boxes: tuple[float, ...], label: str = "car", score: float = 0.9) -> 
 
 
 def crossing(first_px: float, step_px: float, frames: int = 40, **how: object) -> DetectionLog:
-    """A car that crosses the image, left to right where the step is positive."""
+    """Return a car that crosses the image, to the right for a positive step."""
     boxes = [(first_px + step_px * i, 500.0, first_px + step_px * i + 200.0, 640.0) for i in range(frames)]
     return DetectionLog.at_rate([frame(box, **how) for box in boxes], 10.0)  # type: ignore[arg-type]
 
@@ -48,14 +48,14 @@ def test_is_a_channel() -> None:
     assert channel.sightings(0) == ()
 
 
-def test_three_ways_not_to_be_asked() -> None:
+def test_unqueried_has_its_reason() -> None:
     assert query(None).ask(0, bearing(0.0)) == Unqueried("no detections file")
     assert query(EMPTY).ask(nanoseconds(9.0), bearing(0.0)) == Unqueried("no frame at 9.000 s")
     assert query(EMPTY).ask(-1_000_000_000, bearing(0.0)) == Unqueried("no frame at -1.000 s")
     assert query(EMPTY).ask(nanoseconds(2.0), bearing(1.2)) == Unqueried("sector outside the field of view")
 
 
-def test_a_signature_without_a_visible_class_asks_nothing() -> None:
+def test_a_kind_without_camera_classes_is_unqueried() -> None:
     assert isinstance(query(EMPTY).ask(nanoseconds(2.0), bearing(0.0), ()), Unqueried)
 
 
@@ -83,7 +83,7 @@ def test_a_moving_car_is_found_in_its_sector_and_nowhere_else(
         assert isinstance(asked.ask(stamp_ns, bearing(at_its_edge)), Present)
 
 
-def test_a_parked_car_is_seen_but_explains_nothing() -> None:
+def test_a_parked_car_is_a_sighting_and_an_absence() -> None:
     asked = query(crossing(900.0, 0.0))
     (seen,) = asked.sightings(nanoseconds(2.0))
     assert not seen.moving
@@ -101,7 +101,7 @@ def test_only_the_expected_class_counts() -> None:
 
 
 @pytest.mark.parametrize("how", [{"score": 0.74}, {"label": "truck"}])
-def test_what_the_filter_drops_is_neither_there_nor_absent(how: dict[str, object]) -> None:
+def test_a_filtered_box_is_unqueried(how: dict[str, object]) -> None:
     asked = query(crossing(700.0, 20.0, **how))
     assert asked.sightings(nanoseconds(2.0)) == ()
     assert isinstance(asked.ask(nanoseconds(2.0), bearing(0.0)), Unqueried)
@@ -110,7 +110,7 @@ def test_what_the_filter_drops_is_neither_there_nor_absent(how: dict[str, object
     assert isinstance(query(counted).ask(nanoseconds(2.0), bearing(-0.5)), Absent)
 
 
-def test_a_coarse_bearing_asks_the_whole_side() -> None:
+def test_a_coarse_bearing_queries_the_whole_side() -> None:
     asked = query(crossing(300.0, 5.0))
     stamp_ns = nanoseconds(2.0)
     assert isinstance(asked.ask(stamp_ns, bearing(-0.3), side="left"), Present)
@@ -175,7 +175,7 @@ def test_the_mirrored_question_has_the_same_answer(
 
 
 @given(a=AZIMUTHS, b=AZIMUTHS, half_a=st.floats(0.01, 1.5), half_b=st.floats(0.01, 1.5), at=AZIMUTHS)
-def test_the_overlap_holds_what_both_sectors_hold(
+def test_the_overlap_is_the_intersection_of_sectors(
     a: float, b: float, half_a: float, half_b: float, at: float
 ) -> None:
     one, other = Sector(a, half_a), Sector(b, half_b)
@@ -198,7 +198,7 @@ def test_refuses_detections_of_another_camera() -> None:
         query(crossing(1700.0, 2.0))
 
 
-def test_what_sounds_from_behind_an_occluder_is_sought_in_line_of_sight() -> None:
+def test_a_bearing_behind_an_occluder_queries_the_line_of_sight() -> None:
     sight = Sector(0.0, 0.5)
     query = VisionQuery(CENTRED, EMPTY, line_of_sight=sight)
     behind, anywhere = (query.ask(nanoseconds(1.0), asked) for asked in (bearing(0.9), NotUsable("coarse")))
