@@ -1,4 +1,4 @@
-"""Onsets, lead time and false alarms per hour as DESIGN.md defines them."""
+"""Onsets, lead time and false alarms per hour."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ def test_too_late_or_too_early_is_a_miss(onsets):
     assert not onset_outcome(onsets, 7.0).detected
 
 
-def test_the_static_set_s_quantum():
-    # 0.103 h of hazard-free audio: one onset is 9.7 an hour.
+def test_one_onset_of_the_static_set_is_9_7_per_hour():
+    # One onset in 0.103 h of hazard-free audio is 9.7 per hour.
     hops = round(0.103 * 36000)
     alarm = np.zeros(hops, dtype=bool)
     alarm[100:140] = True
@@ -37,7 +37,7 @@ def test_the_static_set_s_quantum():
 
 
 def test_an_onset_at_line_of_sight_is_no_warning():
-    # At 47,998 Hz the hop that ends at T0 = 7 s ends at sample 335,986: 6.3 us before it.
+    # At 47,998 Hz the hop of T0 = 7 s ends at sample 335,986, 6.3 us before T0.
     at_t0_s = round(7.0 * 47_998) / 47_998 - 6.3e-6
     assert not onset_outcome([at_t0_s], 7.0).detected
     assert onset_outcome([at_t0_s - 0.1], 7.0).detected

@@ -1,7 +1,4 @@
-"""Bounds: the paper's numbers, a numerical Fisher matrix for any array, efficiency of a beamformer peak.
-
-The tone is held against its bound in tests/frontend/approach/test_tone.py.
-"""
+"""Cramer-Rao bounds against the paper, numerical Fisher matrices and errors of estimators."""
 
 import json
 
@@ -23,7 +20,6 @@ from worldstate.frontend.bounds.cramer_rao import (
     tone_crb_hz2,
 )
 from worldstate.frontend.direction.bearing import find_peaks, srp_phat
-from worldstate.ground.errors import InvalidArgumentError
 
 SOUND_M_S = 343.0
 positions_strategy = st.integers(0, 2**32 - 1).map(
@@ -31,16 +27,7 @@ positions_strategy = st.integers(0, 2**32 - 1).map(
 )
 
 
-def test_papers_bearing_constant():
-    """1.8 deg / sqrt(2 N SNR) at 1 kHz, broadside, S_xx = 3.027 m^2."""
-    y = np.linspace(-1, 1, 56)
-    y *= np.sqrt(3.027 / np.sum(y**2))
-    plate = np.column_stack([0 * y, y, np.cos(7 * y)])
-    degrees = np.rad2deg(np.sqrt(2 * 10 * 4.0 * bearing_crb_rad2(plate, 0.0, 1000.0, 4.0, 10)))
-    assert degrees == pytest.approx(1.7978, abs=1e-3)
-
-
-def test_built_in_array_has_the_papers_bound():
+def test_the_built_in_array_has_the_bound_of_the_paper():
     variance = bearing_crb_rad2(roof_array_56().positions_m, 0.0, 1000.0, 1.0, 1)
     assert np.rad2deg(np.sqrt(2 * variance)) == pytest.approx(1.8, abs=0.02)
 
@@ -87,21 +74,18 @@ def test_endfire_corollary(azimuth):
 
 @settings(max_examples=30, deadline=None)
 @given(positions=positions_strategy, azimuth=st.floats(-np.pi, np.pi))
-def test_nowhere_is_better_than_broadside(positions, azimuth):
+def test_broadside_is_the_direction_of_most_information(positions, azimuth):
     best = broadside_rad(positions)
     assert -np.pi / 2 < best <= np.pi / 2
     assert endfire_information(positions, best) == pytest.approx(1.0)
     assert endfire_information(positions, azimuth) <= 1.0 + 1e-12
 
 
-def test_endfire_has_no_bearing():
+def test_endfire_has_no_information_about_the_bearing():
     y = np.linspace(-0.4, 0.4, 5)
     line = np.column_stack([0 * y, y, 0 * y])
     assert bearing_crb_rad2(line, np.pi / 2, 1000.0, 1.0, 1) > 1e20
     assert bearing_crb_rad2(line, 0.1, 1000.0, 0.0, 1) == np.inf
-    for ask in (broadside_rad, lambda pole: endfire_information(pole, 0.0)):
-        with pytest.raises(InvalidArgumentError, match="horizontal extent"):
-            ask([[0, 0, 0], [0, 0, 1.0]])
 
 
 @pytest.mark.parametrize(("azimuth_deg", "snr"), [(0.0, 0.3), (0.0, 3.0), (20.0, 1.0), (65.0, 3.0)])
@@ -130,14 +114,14 @@ def test_beamformer_peak_meets_the_bearing_bound(azimuth_deg, snr):
 
 
 def bearing_trial(array, azimuth_deg, snr_db, trials):
-    """Return mean squared error of SRP-PHAT on the front-end's grid of one degree, and the bound."""
+    """Return the mean squared error of SRP-PHAT on a grid of one degree, and the bound."""
     rng, snapshots, snr = np.random.default_rng(trials), 20, 10 ** (snr_db / 10)
     grid, middle = np.radians(np.arange(-90.0, 91.0)), np.radians(azimuth_deg)
     steering = Steering.towards(array, [1000.0], grid)
     errors = []
     with one_blas_thread():
         for _ in range(trials):
-            # Over one step of the grid, so that its interpolation is tried where it is worst, too.
+            # The truth covers one step of the grid, also where interpolation is worst.
             truth = middle + np.radians(rng.uniform(-0.5, 0.5))
             wave = np.exp(2j * np.pi * rng.uniform(size=(snapshots, 1, 1)))
             noise = rng.normal(size=(2, snapshots, 1, array.n_microphones)) / np.sqrt(2 * snr)
@@ -153,13 +137,13 @@ def bearing_trial(array, azimuth_deg, snr_db, trials):
     [(1, 0.0, 15.0), (1, 0.0, 25.0), (4, 0.0, 15.0), (4, 0.0, 25.0), (1, 45.0, 15.0), (1, 80.0, 15.0)],
 )
 def test_srp_phat_meets_the_bearing_bound(every, azimuth_deg, snr_db):
-    """Within 1.5 dB of the bound, also toward endfire, and never below it beyond three standard errors."""
+    """The error is within 1.5 dB of the bound, also towards endfire, and not below it by over 3 sigma."""
     array = MicrophoneArray(roof_array_56().positions_m[::every])
     found, bound = bearing_trial(array, azimuth_deg, snr_db, trials=300)
     assert 10 * np.log10(1 - 3 * np.sqrt(2 / 300)) < 10 * np.log10(found / bound) < 1.5
 
 
-def test_below_the_threshold_another_lobe_wins():
+def test_side_lobes_dominate_below_the_threshold_snr():
     array = MicrophoneArray(roof_array_56().positions_m[::4])
     found, bound = bearing_trial(array, 0.0, -15.0, trials=60)
     assert 10 * np.log10(found / bound) > 10.0
@@ -176,23 +160,7 @@ def test_tone_bound_equals_a_numerical_fisher_matrix():
     assert radial_speed_crb_m2_s2(variance, frequency) == pytest.approx((343 / 123) ** 2 * variance)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: bearing_crb_rad2([[0.0, 0.0, 0.0]], 0.0, 1000.0, 1.0, 1),
-        lambda: bearing_crb_rad2(np.eye(3), 0.0, 1000.0, -1.0, 1),
-        lambda: bearing_crb_rad2(np.eye(3), np.nan, 1000.0, 1.0, 1),
-        lambda: tone_crb_hz2(0.0, 100, 1000.0),
-        lambda: tone_crb_hz2(1.0, 1, 1000.0),
-        lambda: radial_speed_crb_m2_s2(1.0, 0.0),
-    ],
-)
-def test_bad_input_is_refused(call):
-    with pytest.raises(InvalidArgumentError):
-        call()
-
-
-def test_the_command_knows_the_papers_numbers(capsys):
+def test_the_bounds_command_prints_the_numbers_of_the_paper(capsys):
     assert main(["array", "bounds", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["horizontal_moment_m2"] == pytest.approx(3.03, abs=0.005)

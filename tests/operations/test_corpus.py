@@ -82,7 +82,7 @@ def contents(out: Path) -> dict[str, bytes]:
     }
 
 
-def test_an_array_without_a_model_is_heard_with_no_score_and_no_approach(street, tmp_path):
+def test_an_array_without_a_model_gives_no_scores(street, tmp_path):
     (tmp_path / "in").mkdir()
     shutil.copy(street / "street.wav", tmp_path / "in" / "a.wav")
     (found,) = hear(tmp_path / "in", tmp_path / "out", array=street / "mics.csv", hops=True)
@@ -295,7 +295,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("named", OTHERS)
-def test_a_folder_that_was_begun_in_another_way_is_refused(named, corpus, options, heard):
+def test_a_folder_begun_with_other_options_raises_an_error(named, corpus, options, heard):
     with pytest.raises(InputFileError, match=f"settings of its first run, got {named}: another --out"):
         hear(corpus, heard, **options | OTHERS[named])
 
@@ -313,13 +313,13 @@ def test_a_manifest_names_sites_and_what_belongs_to_a_recording(corpus, tmp_path
     ("text", "problem"),
     [("file\na.wav\n", "missing path"), ("path\na.wav\na.wav\n", "a.wav twice"), ("path\n", "got none")],
 )
-def test_a_manifest_that_means_nothing_is_refused(text, problem, tmp_path):
+def test_wrong_manifests_raise_an_error(text, problem, tmp_path):
     (tmp_path / "list.csv").write_text(text)
     with pytest.raises(InputFileError, match=problem):
         find_corpus(tmp_path / "list.csv")
 
 
-def test_a_share_that_is_none_is_refused(corpus, options, tmp_path):
+def test_wrong_shards_raise_an_error(corpus, options, tmp_path):
     with pytest.raises(InvalidArgumentError, match="shard: expected"):
         hear(corpus, tmp_path, shard=(4, 3), **options)
 
@@ -409,7 +409,7 @@ def test_a_cascade_hears_what_is_louder_and_what_lies_around_it(quiet, options, 
     assert LEFT_OUT not in hops[whole]
 
 
-def test_the_recall_of_a_cascade_is_that_of_recordings_heard_whole(quiet, options, tmp_path, capsys):
+def test_the_recall_of_a_cascade_is_measured_on_whole_recordings(quiet, options, tmp_path, capsys):
     meter = ApproachMeter("a", "")
     for state in states_of([{"left"} if hop in (50, 150) else set() for hop in range(200)]):
         meter.update(state)

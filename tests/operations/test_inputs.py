@@ -150,7 +150,7 @@ def test_a_dead_microphone_is_no_reason_for_waves(tmp_path: Path) -> None:
     assert not sources_of(tmp_path / "b.csv").any()
 
 
-def test_whole_numbers_of_a_converter_are_brought_to_full_scale() -> None:
+def test_integer_samples_are_scaled_to_full_scale() -> None:
     array = MicrophoneArray(ring(4, 0.2))
     sound = wave(array, 20.0)
     exact = np.round(sound * 2**15)

@@ -172,7 +172,7 @@ def test_the_true_track_of_a_pass_is_drawn_while_it_lasts(labelled):
     assert true.get_xdata()[[0, -1]] == pytest.approx(np.interp(ends_s, time_s, places[:, 1]), abs=0.5)
 
 
-def test_a_list_of_labels_lies_with_its_recording(tmp_path):
+def test_a_list_of_labels_is_beside_or_above_its_recording(tmp_path):
     sound = tmp_path / "a" / "street.wav"
     assert file_below(sound, tmp_path / "labels.csv") == "a/street.wav"
     with pytest.raises(InputFileError, match=r"folder of street\.wav or above"):

@@ -95,7 +95,7 @@ def test_a_viewer_that_comes_late_is_sent_the_last_minute(states, monkeypatch):
             assert [row["t"] for row in json.loads(viewer.recv(timeout=20.0))] == [0.5, 0.6, 0.7, 0.8]
 
 
-def test_only_its_own_page_and_programs_of_this_machine_are_given_states(states):
+def test_other_origins_receive_no_states(states):
     with LivePage(0) as page:
         page.show(hop(states[0]))
         for origin in (page.url.rstrip("/"), page.url.rstrip("/").replace("127.0.0.1", "localhost"), None):

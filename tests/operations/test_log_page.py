@@ -136,11 +136,6 @@ def test_the_command_writes_a_part_of_a_log_beside_it(states, tmp_path, capsys):
     assert "ending in .html" in capsys.readouterr().err
 
 
-def test_no_state_is_refused():
-    with pytest.raises(InvalidArgumentError, match="at least one snapshot"):
-        page_data([])
-
-
 def logged_sound(samples, rate_hz, begins_ns=0):
     """Return what a log holds of sound in [-1, 1): blocks of a tenth of a second, each with its stamp."""
     size = rate_hz // 10
@@ -207,7 +202,7 @@ def test_a_long_sound_is_cut_and_says_so(states, monkeypatch):
     assert "sound is that of the first 0.2 s" in data["remarks"][-1]
 
 
-def test_sound_that_would_be_played_wrongly_is_refused(states):
+def test_sound_in_another_format_raises_an_error(states):
     blocks = logged_sound(np.full(8000, 0.5, np.float32), 8000)
     for wrong in (
         {"number_of_channels": 2},

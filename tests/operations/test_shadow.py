@@ -1,4 +1,4 @@
-"""Shadow hours: what is counted, its exact intervals, and how many more hours prove a budget."""
+"""Shadow hours: counts, exact intervals and the further hours that prove a budget."""
 
 import math
 
@@ -23,7 +23,7 @@ HOURS = st.builds(
 
 
 @given(st.lists(HOURS, min_size=1))
-def test_every_way_to_count_has_the_same_hours_and_onsets(rows):
+def test_all_groupings_have_the_same_hours_and_onsets(rows):
     week = shadow_hours(rows, budget=30.0)
     heard = sum(row.hops for row in rows if row.unheard is None) / 36_000
     for group in week.values():
@@ -42,7 +42,7 @@ def test_every_way_to_count_has_the_same_hours_and_onsets(rows):
 
 
 @given(st.integers(0, 50), st.floats(0.1, 1e4), st.floats(0.01, 100.0))
-def test_so_many_more_hours_prove_a_budget_and_no_fewer(onsets, hours, budget):
+def test_hours_to_prove_a_budget_are_the_fewest(onsets, hours, budget):
     more = hours_to_prove(onsets, hours, budget)
     if onsets >= budget * hours:
         assert more is None
@@ -53,11 +53,11 @@ def test_so_many_more_hours_prove_a_budget_and_no_fewer(onsets, hours, budget):
         assert upper[0] == pytest.approx(budget, rel=1e-3)
 
 
-def test_without_an_onset_the_hours_are_those_of_the_rule_of_three():
+def test_hours_without_an_onset_follow_the_rule_of_three():
     assert hours_to_prove(0, 1.0, 1.0) == pytest.approx(-math.log(0.025) - 1.0, abs=1e-4)
 
 
-def test_the_page_shows_names_as_text_and_says_what_it_leaves_out(tmp_path):
+def test_the_shadow_page_escapes_names_and_counts_omitted_rows(tmp_path):
     rows = [StateHours("a", f"<script>{i}", None, "acoustic working", None, 36_000, i) for i in range(50)]
     write_shadow_page(tmp_path / "week.html", shadow_hours(rows, None), "fleet & co")
     page = (tmp_path / "week.html").read_text()

@@ -1,4 +1,4 @@
-"""Lead time and hand-over, read off a stream of states."""
+"""Lead time and hand-over of a stream of states."""
 
 import numpy as np
 import pytest
@@ -36,27 +36,27 @@ def test_lead_time_counts_from_the_first_onset_within_five_seconds():
     assert got.hidden_entity_id == "again"
 
 
-def test_an_advisory_after_line_of_sight_leads_nothing():
+def test_an_advisory_after_line_of_sight_has_no_lead_time():
     got = summary(4.0, {6.0: "late"})
     assert got.lead_time_s is None
     assert got.first_advisory_s == 6.0
     assert got.advisories_after_t0 == 1
 
 
-def test_every_onset_is_false_where_nothing_approaches():
+def test_every_onset_of_a_hazard_free_recording_is_false():
     got = summary(None, {2.0: "a", 5.0: "b"}, hazard_free=True)
     assert got.lead_time_s is None
     assert got.false_advisories_before == 2
     assert got.advisories_after_t0 is None
 
 
-def test_no_onset_is_called_false_where_nobody_knows_what_was_there():
+def test_onsets_of_unlabelled_recordings_are_not_called_false():
     got = summary(None, {2.0: "a", 5.0: "b"})
     assert got.false_advisories_before is None
     assert got.advisory_onsets_s == (2.0, 5.0)
 
 
-def test_parked_cars_are_no_hand_over():
+def test_parked_cars_are_not_handed_over():
     def seen(name: str, moving: bool) -> Entity:
         return Entity(name, "visible", 0.9, 0.0, 0.1, 0.02, created_ns=0, updated_ns=0, moving=moving)
 
@@ -94,7 +94,7 @@ LEFT = track("left", 6.0, 8.0)
         ),
     ],
 )
-def test_each_vehicle_is_told_with_the_time_by_which_it_was_announced(onsets_s, truth, told):
+def test_the_announcement_states_the_lead_time_of_each_vehicle(onsets_s, truth, told):
     hops = [hop / 10 for hop in range(100)]
     states = [state(time_s, any(at <= time_s < at + 0.3 for at in onsets_s)) for time_s in hops]
     assert announcement(states, truth, "a van") == told

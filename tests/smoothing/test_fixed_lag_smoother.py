@@ -1,4 +1,4 @@
-"""The smoother against filterpy's RTS; late observations, first sight."""
+"""The fixed-lag smoother against the RTS smoother of filterpy; late observations and first sight."""
 
 import math
 
@@ -14,8 +14,7 @@ from smoothing_problem import (
 )
 
 from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.measurement import Approach, Bearing, Position
+from worldstate.measurement import Bearing, Position
 from worldstate.smoothing import AngularHeight, FixedLagSmoother, Range, SmoothedTrack, SmoothingSettings
 
 EXACT = SmoothingSettings(robust_k=1e4)
@@ -30,7 +29,7 @@ def test_rts_of_filterpy_agrees():
     kalman.x, kalman.P = np.array([20.0, 10.0, -3.0, -2.0]), np.diag([4.0, 4.0, 1.0, 1.0])
     kalman.F, kalman.H, kalman.R = np.eye(4) + t * np.eye(4, k=2), np.eye(2, 4), np.diag([0.5, 0.8])
     kalman.Q = np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
-    # Nothing is known of it but its first position and velocity.
+    # The prior is flat; the first position and velocity define the belief.
     anywhere = MotionBelief.around((0.5, 0.0, -0.2, math.log(22.0)), (1e4,) * 4)
     first = Position((20.0, 10.0), tuple(map(tuple, kalman.P.tolist())), velocity_mps=(-3.0, -2.0))
     truth = np.array([20.5, 9.0, -3.2, -2.1])
@@ -40,7 +39,7 @@ def test_rts_of_filterpy_agrees():
     smoother.update(0, {"car": [first]})
     for k, place in enumerate(measured):
         smoother.update(k * HOP_NS, {"car": [Position(tuple(place), ((0.5, 0.0), (0.0, 0.8)))]})
-    # filterpy predicts before its first update, where the belief is already that of the first measurement.
+    # The first update of filterpy has no prediction before it.
     kalman.update(np.array(measured[0]))
     means, covariances = [kalman.x.copy()], [kalman.P.copy()]
     for place in measured[1:]:
@@ -54,19 +53,19 @@ def test_rts_of_filterpy_agrees():
     np.testing.assert_allclose(track.covariance, spread, atol=1e-6)
 
 
-def test_hidden_phase_is_corrected_by_what_is_seen_later():
+def test_later_positions_correct_the_hidden_phase():
     filtered, smoothed = np.array([hidden_errors_m(seed) for seed in range(5)]).T
     assert np.sqrt((smoothed**2).mean()) < 0.25 * np.sqrt((filtered**2).mean())
 
 
 @pytest.mark.slow
-def test_a_fifth_of_the_filters_error_in_sixty_runs():
+def test_smoothing_reduces_the_error_to_a_fifth():
     filtered, smoothed = np.array([hidden_errors_m(seed) for seed in range(60)]).T
     assert np.sqrt((smoothed**2).mean()) < 0.2 * np.sqrt((filtered**2).mean())
 
 
 @pytest.mark.parametrize(("own_state", "within_m"), [(True, 1e-6), (False, 0.1)])
-def test_what_comes_late_counts_as_in_order(own_state, within_m):
+def test_late_observations_equal_those_in_order(own_state, within_m):
     observations = heard_then_seen(np.random.default_rng(3)).observations
     tracks = []
     for late_hops in (0, 3):
@@ -89,7 +88,7 @@ def test_what_comes_late_counts_as_in_order(own_state, within_m):
     assert np.abs(places[0] - places[1]).max() < within_m
 
 
-def test_what_comes_later_than_the_lag_is_dropped_and_counted():
+def test_observations_later_than_the_lag_are_dropped_and_counted():
     smoother = FixedLagSmoother(SmoothingSettings(lag_s=2.0))
     for hop in range(50):
         smoother.update(hop * HOP_NS, {"car": [Bearing(0.5, 0.1)]})
@@ -100,7 +99,7 @@ def test_what_comes_later_than_the_lag_is_dropped_and_counted():
     np.testing.assert_array_equal(smoother.track("car").states, before)
 
 
-def test_an_entity_that_is_silent_beyond_the_lag_begins_anew():
+def test_an_entity_without_observations_beyond_the_lag_restarts():
     smoother = FixedLagSmoother(SmoothingSettings(lag_s=2.0))
     smoother.update(0, {"car": [Bearing(0.5, 0.1)]})
     smoother.update(100 * HOP_NS, {"bus": [Bearing(0.1, 0.1)]})
@@ -126,7 +125,7 @@ def test_an_outlier_among_bearings_costs_little():
     assert np.abs(final(1.0) - final(0.0)).max() < 0.02
 
 
-def test_who_stops_at_once_in_view_drove_on_before_it():
+def test_braking_in_view_does_not_change_the_hidden_phase():
     # Hidden for 2.5 s at 8 m/s, then seen, and at a walk from 2.8 s on.
     rng, time_s = np.random.default_rng(0), np.arange(45) * 0.1
     true_y = 26.0 - np.concatenate([[0.0], np.cumsum(np.where(time_s < 2.8, 0.8, 0.05))[:-1]])
@@ -161,7 +160,7 @@ def test_a_height_is_learned_from_boxes():
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_first_sight_is_when_the_edge_was_passed(side):
+def test_first_sight_is_the_passing_of_the_edge(side):
     smoother, rng = FixedLagSmoother(), np.random.default_rng(2)
     edge_rad, errors_s = side * math.atan2(3.0, 5.0), []
     for number in range(4):
@@ -183,7 +182,7 @@ def test_first_sight_is_when_the_edge_was_passed(side):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_one_that_overtakes_has_not_come_past_the_edge_of_the_other_side(side):
+def test_an_overtaking_vehicle_passes_only_the_edge_of_its_side(side):
     azimuths = [side * (math.pi - 0.2 * hop) for hop in range(15)]
     passed = [MotionBelief.around((at, -2.0 * side, 0.0, 2.0), (0.03, 0.1, 0.1, 0.2)) for at in azimuths]
     track = SmoothedTrack("car", np.arange(15) * HOP_NS, MotionBelief.stacked(passed))
@@ -191,17 +190,8 @@ def test_one_that_overtakes_has_not_come_past_the_edge_of_the_other_side(side):
     assert track.first_sight(side, 0.55 * side, 0.04).time_s == pytest.approx(1.3, abs=0.01)
 
 
-def test_what_cannot_be_is_refused():
-    smoother = FixedLagSmoother()
-    with pytest.raises(InvalidArgumentError, match="begin with a bearing or position"):
-        smoother.update(0, {"car": [Approach(0.1, 0.1)]})
-    smoother.update(HOP_NS, {"car": [Bearing(0.1, 0.1)]})
-    with pytest.raises(InvalidArgumentError, match="'nobody'"):
-        smoother.track("nobody")
-
-
 @pytest.mark.slow
-def test_an_hour_leaves_memory_and_graph_as_they_were():
+def test_memory_and_graph_stay_bounded_for_an_hour():
     import tracemalloc
 
     def grown(hours: float) -> tuple[int, int, int]:

@@ -16,7 +16,7 @@ SETTINGS = SmoothingSettings(robust_k=1e6)
 X, Y, TALL = range(3)
 
 
-def test_ten_thousand_wrong_shapes_raise_and_none_crashes():
+def test_ten_thousand_wrong_shapes_raise_without_a_crash():
     rng = np.random.default_rng(0)
     raised = 0
     for _ in range(10_000):

@@ -65,7 +65,7 @@ def test_intervals_hold_the_truth_and_narrow_with_passes():
 @pytest.mark.parametrize(
     ("sides", "said"), [((1,), "12 from the left, 0 from"), ((-1,), "0 from the left, 12")]
 )
-def test_vehicles_from_one_side_do_not_tell_the_two_apart(sides, said):
+def test_vehicles_from_one_side_are_not_enough(sides, said):
     with pytest.raises(InvalidArgumentError, match=said):
         align(passes(12, 0.1, 2.0, sides=sides))
 
@@ -119,7 +119,7 @@ def test_the_command_writes_the_car_with_both_added(car, tmp_path, capsys, monke
     np.testing.assert_array_equal(after.array.positions_m, before.array.positions_m)
 
 
-def test_the_array_of_a_car_is_found_from_the_new_file_or_it_is_refused(tmp_path):
+def test_the_array_file_must_exist_beside_the_new_car_file(tmp_path):
     (tmp_path / "mics.csv").write_text("\n".join(",".join(map(str, row)) for row in RINGS))
     (tmp_path / "elsewhere").mkdir()
     path = tmp_path / "car.json"

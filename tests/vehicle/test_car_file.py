@@ -62,7 +62,7 @@ def test_a_tilted_array_in_space_hears_azimuths_of_the_vehicle(tmp_path):
     assert math.degrees(heard.bearing_rad) == pytest.approx(50.0, abs=1.0)
 
 
-def test_cameras_have_names_and_stand_relative_to_the_array(tmp_path):
+def test_cameras_have_names_and_positions_relative_to_the_array(tmp_path):
     car = read_car(written(tmp_path, CAR))
     assert list(car.cameras) == ["front", "left"]
     assert car.camera() is car.cameras["front"]
