@@ -1,4 +1,4 @@
-"""What is rendered up to 2 kHz is what is rendered whole, as far as the feature reaches."""
+"""Rendering up to 2 kHz gives the feature of full bandwidth."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,7 @@ def vehicle_sound(
     samples: int,
     rate: float,
 ) -> np.ndarray:
-    """What an array hears of one vehicle that emits these signals, by every path, (M, n)."""
+    """Return the sound of one vehicle with these signals at an array by every path, (M, n)."""
     knots = np.arange(-(-samples // KNOT_SAMPLES) + 1) * KNOT_SAMPLES / rate
     start_s = -BEFORE * KNOT_SAMPLES / LOW_HZ
     receiver = Receiver(standing_m(array), np.zeros(array.n_microphones), knots, settings.ego)
@@ -75,7 +75,7 @@ def decimated(sound: np.ndarray) -> np.ndarray:
 
 
 def feature_errors(number: int, duration_s: float, array: MicrophoneArray = ARRAY) -> np.ndarray:
-    """Rms of what an eighth of the rate changes, relative to the feature's rms, in every second."""
+    """Return the rms change of the feature at an eighth of the rate, relative to its rms, per second."""
     rng = np.random.default_rng([7, number])
     settings = draw_settings(SITES[number % len(SITES)], ("left", "right")[number % 2], rng, duration_s)
     blocks = BEFORE + -(-int(duration_s * LOW_HZ) // KNOT_SAMPLES)
@@ -104,7 +104,7 @@ def features(sound: np.ndarray, array: MicrophoneArray, rate: float) -> np.ndarr
 
 
 @pytest.mark.slow
-def test_the_feature_at_an_eighth_of_the_rate_is_that_of_the_full_one() -> None:
+def test_the_feature_does_not_change_at_an_eighth_of_the_rate() -> None:
     assert feature_errors(0, 1.0, FEWER).max() < 0.01
 
 
@@ -116,7 +116,7 @@ def test_the_feature_of_ten_recordings_does_not_depend_on_the_rate() -> None:
     assert errors.max() < 0.005
 
 
-def test_lines_of_an_engine_above_half_the_rate_are_left_out_and_not_folded() -> None:
+def test_engine_lines_above_half_the_rate_do_not_alias() -> None:
     # Lines from 1.4 to 2.8 kHz alone: at 3 kHz those above 1.5 kHz would come back below 1.2 kHz.
     two_kilohertz = tuple(90.0 if octave == 5 else 0.0 for octave in range(8))
     kind = replace(LIGHT, harmonic_share=1.0, propulsion_a_db=two_kilohertz, propulsion_b_db=(0.0,) * 8)
@@ -129,7 +129,7 @@ def test_lines_of_an_engine_above_half_the_rate_are_left_out_and_not_folded() ->
         assert below < 1e-4 * REFERENCE_PA**2 * 10.0**9
 
 
-def test_recordings_up_to_two_kilohertz_are_heard_by_the_model_that_ships(tmp_path: Path) -> None:
+def test_the_shipped_model_reads_recordings_up_to_2_khz(tmp_path: Path) -> None:
     words = "sim make --static 2 --bandwidth 2000 --duration 1.6 --seed 3"
     assert main([*words.split(), "--out", str(tmp_path)]) == 0
     (folder,) = (tmp_path / "SA1" / "left").iterdir()
@@ -145,7 +145,7 @@ def test_recordings_up_to_two_kilohertz_are_heard_by_the_model_that_ships(tmp_pa
     assert feature_order(domain, ARRAY, SAMPLE_RATE_HZ, FrontEndSettings()) is None
 
 
-def test_a_model_refuses_sound_that_does_not_hold_its_bands() -> None:
+def test_sound_without_the_bands_of_the_model_raises_an_error() -> None:
     shipped = read_model().signature.domain
     assert shipped is not None
     for rate in (6_000, 8_000, 12_000, 16_000, 24_000):
@@ -156,7 +156,7 @@ def test_a_model_refuses_sound_that_does_not_hold_its_bands() -> None:
 
 
 @given(st.floats(700.0, 32_000.0))
-def test_the_rate_holds_the_band_and_bins_stay(bandwidth_hz: float) -> None:
+def test_the_rate_covers_the_band_and_keeps_the_bins(bandwidth_hz: float) -> None:
     rate = rate_for(bandwidth_hz)
     assert rate == SAMPLE_RATE_HZ or 2.99 * bandwidth_hz <= rate <= 6.01 * bandwidth_hz
     if rate > 5_000.0:

@@ -1,4 +1,4 @@
-"""Sounds some metres away: passes swell, idling engines do not, recorders stay within full scale."""
+"""Sounds at a few metres: levels of passes and idling engines, full scale."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def levels_db(sound: np.ndarray) -> np.ndarray:
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["light", "heavy", "tram"])
-def test_a_pass_swells_and_an_engine_that_idles_stays(kind: str) -> None:
+def test_a_passing_vehicle_swells_and_an_idling_one_does_not(kind: str) -> None:
     drawn = [
         (
             np.ptp(levels_db(close_vehicle(KINDS[kind], STREET.preset, STREET.site, SECONDS, RATE_HZ, one))),
@@ -75,7 +75,7 @@ def test_a_motorcycle_fires_at_multiples_of_half_its_turns(seed: int, speed_mps:
 
 @given(st.integers(0, 1000), st.sampled_from(["dog", "horns", "sweeps", "shots", "tune"]))
 @settings(max_examples=10, deadline=None)
-def test_what_a_recorder_hears_is_finite_and_within_full_scale(seed: int, kind: str) -> None:
+def test_close_sounds_are_finite_and_within_full_scale(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
     heard = recorded(close_sound(kind, 3.0, RATE_HZ, rng), RATE_HZ, rng)
     assert np.isfinite(heard).all()
@@ -83,8 +83,8 @@ def test_what_a_recorder_hears_is_finite_and_within_full_scale(seed: int, kind: 
 
 
 @pytest.mark.long
-def test_a_vehicle_of_another_kind_is_another_sound() -> None:
-    """A tram has most at 250 Hz, a car's tyres at 1 kHz: the octaves say so, whatever the recorder."""
+def test_kinds_of_vehicles_have_different_spectra() -> None:
+    """A tram peaks at 250 Hz, the tyres of a car at 1 kHz, with every recorder."""
     kinds = {name: replace(KINDS[name], ridden_mps=(8.0, 10.0)) for name in ("light", "tram")}
     shares = {}
     for name, kind in kinds.items():

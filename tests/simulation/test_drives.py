@@ -1,4 +1,4 @@
-"""Streams of an ego that drives up to the corner: what it hears, when it sees, who comes."""
+"""Streams of an ego that drives up to the corner: sound, sight and traffic."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def drive(seed: int, traffic: str = "approaches", minutes: float = 0.3) -> Strea
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10_000))
-def test_every_drive_has_one_approach_which_is_seen_shortly_before_the_ego_stops(seed: int) -> None:
+def test_every_drive_has_one_approach_in_view_before_the_stop(seed: int) -> None:
     drawn = drive(seed)
     hazards = [one for one in draw_stream(drawn, PAIR).vehicles if one.hazard]
     assert len(hazards) == {"left": 1, "right": 1, "both": 2, "queue": 2}[hazards[0].event.flow]
@@ -62,7 +62,7 @@ def test_every_drive_has_one_approach_which_is_seen_shortly_before_the_ego_stops
             assert (passes and pictured) == clear
 
 
-def test_an_ego_that_has_stopped_hears_what_a_standing_one_does_and_less_before() -> None:
+def test_after_the_stop_the_sound_is_that_of_a_standing_ego() -> None:
     place = drawn_site("DB101")
     event = VehicleEvent("left", emerges(Driver(place, LIGHT, "left", 6.0, 0.0, 40.0), None), -4.0)  # type: ignore[arg-type]
     microphones = draw_microphones(drive(1), PAIR, np.random.default_rng(3))
@@ -79,7 +79,7 @@ def test_an_ego_that_has_stopped_hears_what_a_standing_one_does_and_less_before(
     assert farther < nearer - 3.0
 
 
-def test_what_is_left_out_of_a_drive_is_not_heard_in_it() -> None:
+def test_sources_removed_from_a_drive_are_inaudible() -> None:
     place, ego = drawn_site("DB102"), EgoMotion(5.0, 5.0)
     event = VehicleEvent("left", emerges(Driver(place, LIGHT, "left", 6.0, 0.0, 60.0), None), -5.0)  # type: ignore[arg-type]
     microphones = draw_microphones(drive(1), PAIR, np.random.default_rng(3))
@@ -97,7 +97,7 @@ def test_what_is_left_out_of_a_drive_is_not_heard_in_it() -> None:
     assert abs(levels[0].mean() - levels[1].mean()) < 0.5
 
 
-def test_the_ego_is_heard_while_it_drives_and_leaves_off_when_it_stands() -> None:
+def test_own_noise_ends_when_the_ego_stops() -> None:
     drawn = drive(4, "empty", 0.25)
     assert drawn.ego.speed_mps > 3.0 and drawn.ego.stop_s < 9.0
     heard = np.concatenate([block.pressure_pa for block in draw_stream(drawn, PAIR).blocks()], axis=1)
@@ -109,8 +109,8 @@ def test_the_ego_is_heard_while_it_drives_and_leaves_off_when_it_stands() -> Non
 
 
 @pytest.mark.parametrize("name", ["DB101", "DTA101", "DMA101"])
-def test_own_wind_that_drowns_the_street_is_heard_as_that(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every hop of a drive is read as simulated, none with 20 dB more of the ego's own wind."""
+def test_strong_own_wind_is_reported_as_wind(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every hop of a drive is usable as simulated, none with 20 dB more of its own wind."""
     array, usable = ovad_array(), []
     for more_db in (0.0, 20.0):
         monkeypatch.setattr(ego_sound, "WIND_AT_10_DB", 74.0 + more_db)
@@ -130,7 +130,7 @@ def test_the_motion_is_the_same_on_every_clock(later_s: float) -> None:
         np.testing.assert_allclose(law(ego.later(later_s), time), law(ego, time + later_s), atol=1e-9)
 
 
-def test_a_place_keeps_its_face_whether_the_ego_moves_or_not() -> None:
+def test_a_place_has_the_same_background_with_a_moving_ego() -> None:
     assert replace(drive(2).site, name="SA103") == drawn_site("SA103")
 
 
@@ -142,7 +142,7 @@ def test_a_drive_is_at_the_place_of_its_renderer(letter: str, kind: str, number:
     assert ego_moves(moving) and not ego_moves(standing)
 
 
-def test_a_drive_in_a_street_of_another_renderer_has_a_name_of_its_own() -> None:
+def test_drives_of_different_renderers_have_different_names() -> None:
     assert replace(site("DMB203"), name="MB203") == site("MB203")
 
 
@@ -161,7 +161,7 @@ def carried(
     rate_hz: float = 6000.0,
     array_x_m: float = 0.0,
 ) -> np.ndarray:
-    """What a pair of microphones on the ego hears of a signal from a place that stands still."""
+    """Return the sound of a static signal at a pair of microphones on the moving ego."""
     plan, knots = drawn_site(name), np.arange(len(signal) // KNOT_SAMPLES + 1) * KNOT_SAMPLES / rate_hz
     positions = PAIR_M + np.array([array_x_m, 0.0, 0.0])
     static = StaticSources(np.zeros((2, len(signal)), np.float32), rate_hz)
@@ -179,7 +179,7 @@ def noise(blocks: int, seed: int = 3) -> np.ndarray:
 
 @settings(max_examples=6, deadline=None)
 @given(CARRIED, st.floats(-30.0, 30.0))
-def test_an_ego_without_speed_hears_what_a_standing_one_does(name: str, y: float) -> None:
+def test_an_ego_of_speed_zero_equals_a_standing_one(name: str, y: float) -> None:
     place = drawn_site(name).lanes_m[0], y
     slow, standing = (carried(name, place, ego, noise(40)) for ego in (EgoMotion(1e-7, 9.0), STANDING))
     assert np.abs(slow - standing).max() < 1e-3 * np.abs(standing).max()
@@ -187,8 +187,10 @@ def test_an_ego_without_speed_hears_what_a_standing_one_does(name: str, y: float
 
 @settings(max_examples=8, deadline=None)
 @given(CARRIED, st.floats(1.0, 4.0), st.floats(0.02, 0.25))
-def test_straight_sound_arrives_when_the_ego_is_there(name: str, speed_mps: float, sent_s: float) -> None:
-    """A click in view is heard first when its way and that of the ego meet, to a sample."""
+def test_direct_sound_arrives_at_the_position_of_the_moving_ego(
+    name: str, speed_mps: float, sent_s: float
+) -> None:
+    """A click in view arrives when its path and that of the ego meet, to one sample."""
     rate_hz, ego = 24_000.0, EgoMotion(speed_mps, 2.0)
     plan = drawn_site(name)
     click = np.zeros(80 * KNOT_SAMPLES)
@@ -209,7 +211,7 @@ def test_straight_sound_arrives_when_the_ego_is_there(name: str, speed_mps: floa
 @settings(max_examples=6, deadline=None)
 @given(CARRIED, st.floats(-25.0, 25.0), st.floats(3.0, 8.0))
 def test_a_tone_stays_a_tone_while_the_ego_passes_places(name: str, y: float, speed_mps: float) -> None:
-    """Places blend without a click; with a block cut off at each, clicks were 36 to 49 dB below the tone."""
+    """Places blend without a click; cutting off one block at each puts clicks 36 to 49 dB below the tone."""
     time = np.arange(94 * KNOT_SAMPLES) / 6000.0
     ends = np.sin(0.5 * np.pi * np.minimum(np.minimum(time / 0.5, (time[-1] - time) / 0.3), 1.0))
     tone = ends**2 * np.sin(2.0 * np.pi * 250.0 * time)
@@ -220,9 +222,7 @@ def test_a_tone_stays_a_tone_while_the_ego_passes_places(name: str, y: float, sp
 
 @settings(max_examples=10, deadline=None)
 @given(st.sampled_from(["DMA101", "DMB203"]), st.floats(-30.0, 30.0), st.floats(-11.0, -0.1))
-def test_an_ego_hears_at_a_place_what_an_array_does_that_stands_there(
-    name: str, y: float, x_m: float
-) -> None:
+def test_at_each_place_a_moving_ego_equals_a_standing_array(name: str, y: float, x_m: float) -> None:
     place, speed_mps = (drawn_site(name).lanes_m[0], y), 0.1
     bass = scipy.signal.butter(4, 200.0, fs=6000.0, output="sos")
     signal = scipy.signal.sosfilt(bass, noise(30))
@@ -233,7 +233,7 @@ def test_an_ego_hears_at_a_place_what_an_array_does_that_stands_there(
 
 
 @given(st.lists(st.floats(-60.0, 0.0), min_size=1, max_size=30), st.sampled_from([1.0, 2.0]))
-def test_places_share_every_moment_of_a_drive(heard_x: list[float], step_m: float) -> None:
+def test_the_weights_of_places_sum_to_one(heard_x: list[float], step_m: float) -> None:
     x, total, mean = np.array(sorted(heard_x)), np.zeros(len(heard_x)), np.zeros(len(heard_x))
     for place_m, span, share in passed_places(x, step_m):
         total[span] += share

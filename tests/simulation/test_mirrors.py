@@ -1,4 +1,4 @@
-"""The renderer of smooth walls against pyroomacoustics' image sources, and the laws of mirror images."""
+"""The renderer of smooth walls against image sources of pyroomacoustics and laws of reflection."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def closed(corners: np.ndarray, kept: np.ndarray) -> Fronts:
 
 
 def reaching(images: mirrors.Images, point: np.ndarray, place: np.ndarray) -> list[tuple[float, ...]]:
-    """Length and gain of every way from a place to a point, the shortest first."""
+    """Return length and gain of every path from a place to a point, the shortest first."""
     found = images.reached_from(place)
     return sorted((float(np.hypot(*(place - images.of(i, point)))), float(images.kept[i, 3])) for i in found)
 
@@ -42,8 +42,8 @@ def reaching(images: mirrors.Images, point: np.ndarray, place: np.ndarray) -> li
     ("corners", "absorbing", "place"),
     [(YARD, [3], (7.3, 4.7)), (JUNCTION, [2, 4, 7], (9.0, 1.0)), (JUNCTION, [2, 4, 7], (8.0, 15.0))],
 )
-def test_images_are_those_of_pyroomacoustics(corners, absorbing, place) -> None:
-    """Ways of all images up to order 3, with their gains; corners hide some, absorbing ends leave nothing."""
+def test_image_sources_equal_those_of_pyroomacoustics(corners, absorbing, place) -> None:
+    """All images up to order 3 with their gains; corners hide some, absorbing ends remove some."""
     pra = pytest.importorskip("pyroomacoustics")
     kept = 0.9 + 0.01 * np.arange(len(corners))
     kept[absorbing] = 0.0
@@ -63,8 +63,8 @@ def test_images_are_those_of_pyroomacoustics(corners, absorbing, place) -> None:
 
 @given(plans, shares, st.floats(-40.0, 40.0), shares, shares)
 @settings(max_examples=25, deadline=None)
-def test_a_way_is_the_same_from_both_ends(plan, ahead, y, own_x, own_y) -> None:
-    """A source and a microphone may change places."""
+def test_paths_are_reciprocal(plan, ahead, y, own_x, own_y) -> None:
+    """A source and a microphone may be exchanged."""
     far = plan.far_kerb_m
     place = np.array([plan.corner_ahead_m + ahead * (far - plan.corner_ahead_m), y])
     left, right = plan.side_wall_left_m, plan.side_wall_right_m
@@ -80,8 +80,8 @@ def test_a_way_is_the_same_from_both_ends(plan, ahead, y, own_x, own_y) -> None:
 
 @given(plans, st.floats(8.0, 60.0))
 @settings(max_examples=20, deadline=None)
-def test_what_is_seen_is_lit_once(plan, y) -> None:
-    """Well inside the straight line the direct image has weight one, well behind the corner none."""
+def test_the_direct_path_has_weight_one_in_view_and_zero_behind_the_corner(plan, y) -> None:
+    """The tolerance excludes the transition at the edge of the shadow."""
     images, lane = trace(drawn_fronts(plan), EAR), plan.lanes_m[0]
     (right, left), direct = plan.sight_m(lane), images.order == 0
     inside, behind = (
@@ -94,7 +94,7 @@ def test_what_is_seen_is_lit_once(plan, y) -> None:
 
 
 def impulses(plan, place: tuple[float, float], positions: np.ndarray) -> np.ndarray:
-    """What microphones hear of a click in the middle of half a second."""
+    """Return the sound of a click in the middle of half a second at the microphones."""
     blocks = round(0.5 * FS / KNOT_SAMPLES)
     click = np.zeros(blocks * KNOT_SAMPLES, np.float32)
     click[len(click) // 2] = 1.0
@@ -113,7 +113,7 @@ RING = np.array([[0.2, 0.1, 1.7], [-0.2, 0.15, 1.6], [0.05, -0.2, 1.9], [-0.05, 
 @given(plans, st.floats(-35.0, 35.0))
 @settings(max_examples=8, deadline=None)
 def test_a_mirrored_plan_sounds_mirrored(plan, y) -> None:
-    """What a microphone hears in a mirrored street of a mirrored source, the mirrored one hears in it."""
+    """Mirroring the street, the source and the microphones leaves the sound unchanged."""
     fronts, turned = drawn_fronts(plan), np.array([1.0, -1.0])
     left, right = plan.corner_left_m, plan.corner_right_m
     other = replace(
@@ -131,8 +131,8 @@ def test_a_mirrored_plan_sounds_mirrored(plan, y) -> None:
     np.testing.assert_allclose(opened[0], opened[1][::-1], rtol=1e-6)
 
 
-def test_the_wall_opposite_is_what_is_heard_of_a_hidden_vehicle() -> None:
-    """Images in that wall are nearly all of the ways that no corner bends, and make a hidden click louder."""
+def test_the_opposite_wall_reflects_a_hidden_vehicle() -> None:
+    """Images in that wall are nearly all undiffracted paths and raise the level of a hidden click."""
     louder = []
     for number in range(1, 13):
         plan = drawn_site(f"MA{number}")
@@ -150,8 +150,7 @@ def test_the_wall_opposite_is_what_is_heard_of_a_hidden_vehicle() -> None:
 
 
 @pytest.mark.parametrize("name", ["TA1", "MB1"])
-def test_a_recording_has_the_town_of_its_street(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recording's ambience comes from the renderer that carries its vehicles."""
+def test_ambience_and_vehicles_use_one_renderer(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     towns = []
     monkeypatch.setattr(renderers, "add_town", lambda *arguments: towns.append(arguments[-1]))
     settings = SimulationSettings(site(name), "none", duration_s=0.6, entry_s=0.45)
@@ -162,8 +161,8 @@ def test_a_recording_has_the_town_of_its_street(name: str, monkeypatch: pytest.M
 
 @given(plans, st.sampled_from([1.0, -1.0]))
 @settings(max_examples=15, deadline=None)
-def test_a_vehicle_comes_out_of_a_shadow_without_a_step(plan, side) -> None:
-    """Straight sound and what its corner bends are half of the free field at the edge of the shadow."""
+def test_the_level_is_continuous_at_the_edge_of_the_shadow(plan, side) -> None:
+    """Direct and diffracted sound are each half of the free field at the edge of the shadow."""
     lane, centre = plan.lanes_m[0], np.array([0.0, 0.0, 1.7])
     edge = abs(plan.sight_m(lane)[0 if side < 0 else 1])
     y = side * (edge + np.arange(40.0, -41.0, -1.0) / 10.0)
@@ -181,8 +180,7 @@ def test_a_vehicle_comes_out_of_a_shadow_without_a_step(plan, side) -> None:
     assert level_db[0] < -9.0 and abs(level_db[-1]) < 1.0
 
 
-def test_walls_that_absorb_all_leave_what_meets_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without reflections a source is heard straight and by its corner, and by nothing else."""
+def test_absorbing_walls_leave_direct_and_diffracted_sound(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = drawn_site("MA7")
     fronts = drawn_fronts(plan)
     monkeypatch.setattr(mirrors, "drawn_fronts", lambda _: Fronts(fronts.ends_m, 0.0 * fronts.kept))

@@ -1,4 +1,4 @@
-"""Places besides the junctions: what is in view there, against a line of sight followed step by step."""
+"""Places other than junctions: sight against a line of sight in small steps."""
 
 import json
 from dataclasses import replace
@@ -11,7 +11,6 @@ from matplotlib.path import Path as Outline
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import (
     PLACES,
     SITES,
@@ -35,14 +34,14 @@ FRAMES_S = np.arange(0.0, 10.0, 0.1)
 
 
 def pictured(x: float, y: float) -> bool:
-    """Whether a point at the camera's height falls into its image."""
+    """Whether a point at the height of the camera is in its image."""
     depth = (x - CAMERA.position_m[0]) * np.cos(CAMERA.pitch_rad)
     focal = 0.5 * CAMERA.width_px / np.tan(CAMERA.half_angle_rad)
     return bool(depth > 0.0 and abs(focal * (y - CAMERA.position_m[1]) / depth) < 0.5 * CAMERA.width_px)
 
 
 def seen_step_by_step(plan, x: float, y: float) -> bool:
-    """Walk from the camera to a point: no body, and no building beside the mouth, is stepped into."""
+    """Whether small steps from the camera to a point meet no body and no building beside the mouth."""
     share = np.linspace(0.0, 1.0, 1500)
     line = np.outer(1.0 - share, CAMERA.position_m[:2]) + np.outer(share, (x, y))
     for body in plan.occluders:
@@ -65,14 +64,14 @@ def seen_step_by_step(plan, x: float, y: float) -> bool:
 
 
 def told(scene: SimulationSettings) -> dict:
-    """Truth of a recording, without its sound."""
+    """Return the truth of a recording without its sound."""
     seen = [path.at(FRAMES_S) for path in trajectories(scene, TIME_S)]
     sights = [line_of_sight(path, scene.site, CAMERA) for path in seen]
     return json.loads(json.dumps(describe(scene, FRAMES_S, seen, sights), allow_nan=False))
 
 
 def check_sight(plan, frames: list[dict]) -> int:
-    """Compare every frame that is not within 10 cm of the edge of a shadow; return how many were in view."""
+    """Compare frames over 10 cm from the edge of a shadow; return how many were in view."""
     in_view = 0
     for frame in frames[::4]:
         x, y = frame["position_m"]
@@ -86,7 +85,7 @@ def check_sight(plan, frames: list[dict]) -> int:
 @pytest.mark.parametrize("name", PLACES)
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_truth_says_what_is_in_view_and_when_it_will_be(name, seed):
+def test_truth_has_sight_and_time_to_visible(name, seed):
     there, rng = place(name), np.random.default_rng(seed)
     for approach in there.approaches:
         scene = draw_settings(there.site.name, approach, rng)
@@ -114,7 +113,7 @@ def test_truth_says_what_is_in_view_and_when_it_will_be(name, seed):
     st.sampled_from([*SITES, *(place(name).site.name for name in PLACES)]),
     st.lists(st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0)), min_size=2, max_size=4),
 )
-def test_on_any_route_sight_is_the_free_line_within_the_image(name, points):
+def test_sight_is_a_free_line_within_the_image(name, points):
     there = next((one for one in map(place, PLACES) if one.site.name == name), None)
     plan = site(name) if there is None else there.site
     if np.hypot(*np.diff(np.array(points), axis=0).T).min() < 1.0:
@@ -137,13 +136,11 @@ def test_a_data_set_of_all_places_has_every_approach_of_each():
     assert found == wanted
 
 
-def test_half_of_the_hazard_free_recordings_have_a_vehicle_and_none_of_the_hazards_has_two():
+def test_half_of_the_hazard_free_recordings_have_a_vehicle():
     rng = np.random.default_rng(3)
     with_one = [len(draw_settings("SO1", "none", rng).traffic) for _ in range(200)]
     assert 70 <= sum(with_one) <= 130
     assert {len(draw_settings("SO1", side, rng).traffic) for side in ("left", "right")} == {1}
-    with pytest.raises(InvalidArgumentError, match="approach"):
-        draw_settings("SM1", "right", rng)
 
 
 QUIET = replace(
@@ -152,7 +149,7 @@ QUIET = replace(
 
 
 @pytest.mark.parametrize(("name", "has_late_sound"), [("open-road", False), ("wide-crossing", True)])
-def test_late_sound_needs_something_that_sends_it(name, has_late_sound):
+def test_late_sound_needs_walls(name, has_late_sound):
     scene = SimulationSettings(place(name).site, "left", 0.5, entry_s=0.4, sample_rate_hz=8e3, preset=QUIET)
     loud, none = (
         simulate_recording(
@@ -164,7 +161,7 @@ def test_late_sound_needs_something_that_sends_it(name, has_late_sound):
     assert np.array_equal(loud, none) != has_late_sound
 
 
-def test_a_vehicle_behind_is_heard_and_never_in_view():
+def test_a_vehicle_behind_is_audible_and_never_in_view():
     scene = SimulationSettings(
         place("open-road").site, "none", 2.0, sample_rate_hz=8e3, preset=QUIET,
         others=(VehicleSettings("left", 1.0, route_m=((-12.0, 60.0), (-12.0, -60.0))),),

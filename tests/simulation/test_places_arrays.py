@@ -1,4 +1,4 @@
-"""Any array, from two microphones to sixty-four in space: shape, level, bearing, what the data set keeps."""
+"""Arrays of 2 to 64 microphones: level, bearing and the array file of the data set."""
 
 import json
 from dataclasses import replace
@@ -13,7 +13,6 @@ from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.bearing import srp_phat
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.simulation import SimulationSettings, place, preset, simulate_recording
 
 FS, NFFT = 12_000.0, 128
@@ -29,9 +28,7 @@ ARRAYS = {
     "lying": 0.1 * np.concatenate([GRID, ZERO], axis=1),
     "cube": 0.2 * CUBE + [0.0, 0.0, 3.0],
     "ball": np.random.default_rng(4).uniform(-0.4, 0.4, (64, 3)),
-    "too tall": [[0.0, 0.1, 0.0], [0.0, -0.1, 3.6]],
 }
-POSSIBLE = sorted(set(ARRAYS) - {"too tall"})
 FRONT_AS_BACK, LEFT_AS_RIGHT = ("pair", "line across", "upright"), ("line along",)
 AZIMUTHS_DEG = np.arange(-180.0, 180.0, 2.0)
 STILL = {"ambient_octaves_db": (-20.0,) * 8, "wind_100hz_db": -20.0, "self_noise_db": 0.0}
@@ -41,7 +38,7 @@ QUIET = replace(preset(), far_rate=0.0, ambient_waves=8, **STILL, **EXACT)
 
 @lru_cache
 def passing(azimuth_deg: float, name: str) -> np.ndarray:
-    """What an array hears of a slow car that is 15 m away at an azimuth, in the open."""
+    """Return the sound of a slow car 15 m away at an azimuth, in the open."""
     x, y = 15.0 * np.cos(np.radians(azimuth_deg)), 15.0 * np.sin(np.radians(azimuth_deg))
     # Its axles are behind the front: towards us, so that both are at the same azimuth.
     way = ((2.0 * x, 2.0 * y), (x, y))
@@ -68,9 +65,9 @@ def apart_deg(one: float, other: float) -> float:
     return abs(wrapped(one - other))
 
 
-@pytest.mark.parametrize("name", POSSIBLE)
+@pytest.mark.parametrize("name", sorted(ARRAYS))
 @pytest.mark.parametrize("azimuth_deg", [30.0, -124.0])
-def test_an_array_hears_a_vehicle_where_its_geometry_allows(name, azimuth_deg):
+def test_bearings_are_right_up_to_the_symmetry_of_the_array(name, azimuth_deg):
     array = MicrophoneArray(ARRAYS[name])
     sound = passing(azimuth_deg, name)
     assert sound.shape == (6000, array.n_microphones)
@@ -88,8 +85,8 @@ def test_an_array_hears_a_vehicle_where_its_geometry_allows(name, azimuth_deg):
         assert there < 0.9 * here
 
 
-def test_the_level_is_that_of_the_place_whatever_the_array():
-    levels = [10 * np.log10(np.mean(passing(30.0, name) ** 2)) for name in POSSIBLE]
+def test_the_level_does_not_depend_on_the_array():
+    levels = [10 * np.log10(np.mean(passing(30.0, name) ** 2)) for name in ARRAYS]
     assert np.ptp(levels) < 0.3
 
 
@@ -101,8 +98,3 @@ def test_the_data_set_keeps_the_array_with_its_heights(tmp_path, capsys):
     (folder,) = json.loads(capsys.readouterr().out)["folders"]
     np.testing.assert_array_equal(read_array(tmp_path / "d" / "array.xml").positions_m, ARRAYS["cube"])
     assert soundfile.info(tmp_path / "d" / folder / "out_multi.wav").channels == 8
-
-
-def test_an_array_that_reaches_below_the_road_is_refused():
-    with pytest.raises(InvalidArgumentError, match=r"1\.80 m below"):
-        passing(0.0, "too tall")

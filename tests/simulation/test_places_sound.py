@@ -1,4 +1,4 @@
-"""Sound of a source anywhere, in the open and in the ego's own street, against closed forms."""
+"""Sound of a source in the open and in the own street against closed forms."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ ONE = np.array([[0.0, 0.0, HEIGHT_M]])
 
 
 def band_noise(samples: int, seed: int = 1) -> np.ndarray:
-    """White noise up to 2 kHz, of unit variance."""
+    """Return white noise up to 2 kHz of unit variance."""
     spectrum = np.fft.rfft(np.random.default_rng(seed).standard_normal(samples))
     spectrum[np.fft.rfftfreq(samples, 1 / FS) > 2000.0] = 0.0
     found = np.fft.irfft(spectrum, samples)
@@ -39,7 +39,7 @@ def band_noise(samples: int, seed: int = 1) -> np.ndarray:
 
 
 def tones(samples: int) -> np.ndarray:
-    """A hundred tones up to 5 kHz: as loud in every tenth of a second, and in step with no path's length."""
+    """Return 100 tones up to 5 kHz with constant level and no common phase."""
     rng, time = np.random.default_rng(2), np.arange(samples) / FS
     found = np.zeros(samples)
     for number in range(1, 101):
@@ -54,7 +54,7 @@ def whole(seconds: float) -> int:
 def heard(
     plan: Site, way, seconds: float, positions=ONE, height_m: float = HEIGHT_M, sound=band_noise
 ) -> tuple:
-    """What microphones hear of a sound that goes `way(t)`, and the sound, which begins `HEAD_S` earlier."""
+    """Return the sound of a source on the route `way(t)`, and the source from `HEAD_S` earlier."""
     head, samples = whole(HEAD_S), whole(seconds)
     noise = sound(head + samples)
     emission = Emission.of(noise.astype(np.float32), -head / FS, FS)
@@ -74,7 +74,7 @@ def standing(x: float, y: float):
 
 
 def arrivals(noise: np.ndarray, lengths: np.ndarray, gains: np.ndarray, samples: int) -> np.ndarray:
-    """Sum of copies, each late by its length and weaker by it: delays as phases."""
+    """Return the sum of copies with the delay and gain of each path, by phases."""
     spectrum, f = np.fft.rfft(noise), np.fft.rfftfreq(len(noise), 1 / FS)
     response = (gains / lengths) @ np.exp(-2j * np.pi * f * lengths[:, None] / SPEED_OF_SOUND_MPS)
     return np.fft.irfft(spectrum * response, len(noise))[-samples:]
@@ -86,7 +86,7 @@ def error_db(found: np.ndarray, expected: np.ndarray) -> float:
 
 @settings(max_examples=12, deadline=None)
 @given(st.floats(-100.0, 100.0), st.floats(-60.0, 60.0), st.floats(0.05, 5.0))
-def test_in_the_open_a_source_anywhere_is_heard_by_1_over_r_after_r_over_c(x, y, height):
+def test_open_space_has_gain_1_over_r_and_delay_r_over_c(x, y, height):
     distance = np.sqrt(x**2 + y**2 + (HEIGHT_M - height) ** 2)
     if distance < 1.0:
         return
@@ -95,7 +95,7 @@ def test_in_the_open_a_source_anywhere_is_heard_by_1_over_r_after_r_over_c(x, y,
 
 
 def corridor(y: float, left: float, right: float, order: int) -> list[tuple[float, int]]:
-    """Images of a source in two parallel walls by reflecting it again and again, and their orders."""
+    """Return images of a source in two parallel walls by repeated reflection, and their orders."""
     found = [(y, 0)]
     for first in (True, False):
         place, at_left = y, first
@@ -107,7 +107,7 @@ def corridor(y: float, left: float, right: float, order: int) -> list[tuple[floa
 
 
 @pytest.mark.parametrize("at", [(-12.0, 1.0), (3.0, -2.8), (-6.0, 3.0), (0.5, 2.0), (-25.0, -1.3)])
-def test_in_the_own_street_a_source_is_heard_with_its_images_in_both_side_walls(at):
+def test_the_own_street_has_images_in_both_side_walls(at):
     x, y = at
     (found,), noise = heard(STREET, standing(x, y), 0.15)
     images = corridor(y, 3.1, 2.9, 3)
@@ -117,8 +117,8 @@ def test_in_the_own_street_a_source_is_heard_with_its_images_in_both_side_walls(
 
 
 @pytest.mark.parametrize("x", [-6.45, -30.0, 2.0])
-def test_the_wall_opposite_sends_back_what_comes_from_the_own_street(x):
-    """One image more, at twice the way to the wall, through the mouth; the near facade has no part in it."""
+def test_the_opposite_wall_reflects_the_own_street(x):
+    """One more image at twice the distance to the wall; the near facade has no image."""
     plan = Site(
         "Wall1", 2.8, 2.8, 4.45, 9.9, 2.8, 2.8, 5.45, facade_reflection=0.6, side_order=0, facade_order=2
     )
@@ -134,8 +134,8 @@ def test_a_wall_in_the_open_adds_its_image_at_the_right_delay():
     assert error_db(found, arrivals(noise, lengths, gains, len(found))) < -40.0
 
 
-def test_behind_a_wall_nothing_comes_straight_and_beyond_its_end_it_does():
-    """Whitened by the source: how much arrives at the time of the straight line, against all of it."""
+def test_a_wall_blocks_the_direct_path_up_to_its_end():
+    """Compare the whitened energy at the time of the direct path with all energy."""
     shares = []
     for x in (-8.0, 3.0, 45.0):
         (found,), noise = heard(MERGE, standing(x, 5.6), 0.15)
@@ -147,8 +147,8 @@ def test_behind_a_wall_nothing_comes_straight_and_beyond_its_end_it_does():
     assert shares[2] == pytest.approx(1.0, abs=0.03)
 
 
-def test_an_ego_that_drives_hears_a_source_in_its_street_first_ahead_and_then_behind():
-    """Every image is passed, too: a tone after its own changing way, Doppler and all."""
+def test_a_driving_ego_passes_a_source_in_its_street():
+    """A tone on the changing length of each image, with its Doppler shift."""
     ego, f = EgoMotion(8.0, 10.0), 500.0
     receiver = Receiver(ONE, np.zeros(1), np.arange(whole(1.0) // KNOT_SAMPLES + 1) * KNOT_SAMPLES / FS, ego)
     start = -whole(HEAD_S) / FS
@@ -167,7 +167,7 @@ def test_an_ego_that_drives_hears_a_source_in_its_street_first_ahead_and_then_be
 
 
 def bearing_deg(sound: np.ndarray, array: MicrophoneArray) -> float:
-    """Azimuth of the largest SRP over all directions, degrees."""
+    """Return the azimuth of the largest SRP over all directions, degrees."""
     azimuths, bins = np.radians(np.arange(-180.0, 180.0, 2.0)), slice(4, 20)
     steering = Steering.towards(array, np.arange(bins.start, bins.stop) * FS / NFFT, azimuths)
     frames = sound.shape[1] // NFFT
@@ -182,7 +182,7 @@ def apart_deg(one: float, other: float) -> float:
 
 @pytest.mark.parametrize("azimuth_deg", np.arange(-180.0, 180.0, 45.0))
 @pytest.mark.parametrize("plan", [OPEN, STREET], ids=["open", "street"])
-def test_a_source_on_any_side_is_heard_from_there(plan, azimuth_deg):
+def test_the_loudest_direction_is_that_of_the_source(plan, azimuth_deg):
     distance = 12.0 if plan.is_open else 2.2
     x, y = distance * np.cos(np.radians(azimuth_deg)), distance * np.sin(np.radians(azimuth_deg))
     sound, _ = heard(plan, standing(x, y), 0.2, WHEEL.centred_m + ONE)
@@ -190,7 +190,7 @@ def test_a_source_on_any_side_is_heard_from_there(plan, azimuth_deg):
 
 
 def level_steps_db(plan: Site, points, speed: float, seconds: float) -> np.ndarray:
-    """Changes of level from one tenth of a second to the next along a route."""
+    """Return changes of level per tenth of a second along a route."""
     way = along(points)
     (found,), _ = heard(plan, lambda time: way.at(speed * time), seconds, sound=tones)
     tenths = len(found) // int(0.1 * FS)
@@ -203,8 +203,8 @@ DRAWN_ONLY = (Phase.explicit, Phase.reuse, Phase.generate)  # each takes half a 
 
 @settings(max_examples=4, deadline=None, phases=DRAWN_ONLY)
 @given(st.floats(1.2, 1.8), st.floats(3.0, 4.5), st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
-def test_level_has_no_steps_from_behind_the_ego_through_the_mouth_into_an_arm(beside, beyond, side, arm):
-    """1.5 m/s: small ones until the corner's shadow falls on the array, which is a steep edge itself."""
+def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, arm):
+    """At 1.5 m/s steps are small until the steep edge of the corner's shadow."""
     # Draws have .8 to 1.1 dB at most, one in many had 1.54: with steps half as long it was gone, where a
     # click would have stayed.
     across, lane = side * beside, STREET.corner_ahead_m + beyond
@@ -218,7 +218,7 @@ def test_level_has_no_steps_from_behind_the_ego_through_the_mouth_into_an_arm(be
 
 @settings(max_examples=4, deadline=None, phases=DRAWN_ONLY)
 @given(st.floats(3.6, 9.0), st.booleans())
-def test_level_has_no_steps_past_a_wall_in_the_open(off, hidden):
-    """Behind the wall and out past its end, or before it, where its image comes and goes."""
+def test_the_level_is_continuous_past_a_wall_in_the_open(off, hidden):
+    """The route is behind the wall and past its end, or before it with its image."""
     y = 2.6 + off if hidden else 1.0 - off
     assert np.abs(level_steps_db(MERGE, ((-9.0, y), (18.0, y)), 4.0, 6.0)).max() < 1.5

@@ -1,4 +1,4 @@
-"""The second renderer against image sources, and against what a wedge does."""
+"""The second renderer against image sources and the diffraction of a wedge."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ KEPT = 0.7
 
 
 def walled_yard(scattered: float = 0.0) -> Houses:
-    """A yard between four walls under the open sky, the array at its middle."""
+    """Return a yard of four walls under the open sky with the array in the middle."""
     x, y = 0.5 * ROOM_M[0], 0.5 * ROOM_M[1]
     corners = np.array([(-x, -y), (x, -y), (x, y), (-x, y)])
     ends = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
@@ -30,8 +30,8 @@ def walled_yard(scattered: float = 0.0) -> Houses:
 
 
 @pytest.mark.long
-def test_mirrored_rays_leave_what_image_sources_do() -> None:
-    """Energy of all echoes, and where they come from, of pyroomacoustics' images in the same yard."""
+def test_specular_rays_equal_image_sources() -> None:
+    """Energy and directions of all echoes against images of pyroomacoustics in the same yard."""
     pra = pytest.importorskip("pyroomacoustics")
     found = trace(walled_yard(), EAR_M, np.random.default_rng(1), rays=400_000)
     places = np.array([(-8.0, -3.0), (5.0, 7.0), (11.0, -6.0)])
@@ -56,8 +56,8 @@ def test_mirrored_rays_leave_what_image_sources_do() -> None:
         assert abs(traced - seen) < 0.1
 
 
-def test_a_corner_is_half_of_the_straight_line_where_the_shadow_begins() -> None:
-    """At the boundary of a shadow 6 dB, of high octaves; deeper in and higher up more."""
+def test_diffraction_is_6_db_at_the_edge_of_the_shadow() -> None:
+    """At high octaves 6 dB at the boundary, more deeper in the shadow and at higher frequencies."""
     ahead, beside = 5.0, 3.0
     x = np.full(3, 9.0)
     y = beside * 9.0 / ahead + np.array([0.0, 3.0, 12.0])
@@ -67,8 +67,8 @@ def test_a_corner_is_half_of_the_straight_line_where_the_shadow_begins() -> None
     np.testing.assert_allclose(corner_gain((ahead, -beside), x, -y), corner_gain((ahead, beside), x, y))
 
 
-def test_rough_walls_send_sound_where_mirrors_do_not() -> None:
-    """Scattering spreads the energy over directions and loses none of it."""
+def test_rough_walls_scatter_without_loss() -> None:
+    """Scattering spreads energy over directions and keeps its sum."""
     smooth, rough = (trace(walled_yard(s), EAR_M, np.random.default_rng(2)) for s in (0.0, 1.0))
     place = np.array([10.0]), np.array([6.0])
     shares = [_at(one.energy, *place)[0, :, 3] for one in (smooth, rough)]
@@ -79,8 +79,8 @@ def test_rough_walls_send_sound_where_mirrors_do_not() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["TA7", "TB7", "TB8"])
-def test_a_drawn_street_hides_and_opens(name: str) -> None:
-    """Sound of an arm falls with distance, and comes in by the mouth; what is open adds up to one."""
+def test_drawn_streets_have_shadows_and_openings(name: str) -> None:
+    """Sound of an arm falls with distance and enters by the mouth; open shares sum to one."""
     plan = drawn_site(name)
     here = reached(plan, EAR_M)
     assert here.open.sum() == pytest.approx(1.0)

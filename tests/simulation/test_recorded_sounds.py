@@ -1,4 +1,4 @@
-"""Recordings in the place of synthesis: their spectrum, the level of the table, and what is refused."""
+"""Recorded sounds in place of synthesis: spectrum, level and errors."""
 
 import json
 from dataclasses import replace
@@ -34,8 +34,8 @@ def folder_of(root: Path, kind: str, sound: np.ndarray, rate: int, suffix: str =
 
 @pytest.mark.parametrize("rate", [6_000.0, 47_998.0])
 @pytest.mark.parametrize("suffix", ["wav", "flac"])
-def test_a_recording_has_its_spectrum_and_the_level_of_its_kind(tmp_path, rate, suffix):
-    """Round 1 kHz the A-weighting is 0 dB: the level is the plain one. The second channel is not heard."""
+def test_recorded_sounds_have_their_spectrum_and_the_level_of_their_kind(tmp_path, rate, suffix):
+    """A-weighting is 0 dB around 1 kHz; the second channel is ignored."""
     sound = np.column_stack([band_noise(5.0, 44_100), band_noise(5.0, 44_100, 200.0, 300.0)])
     folder = folder_of(tmp_path, "dog", sound, 44_100, suffix)
     heard = emitted(SOUNDS["dog"], round(3.0 * rate), rate, np.random.default_rng(2), folder)
@@ -46,7 +46,7 @@ def test_a_recording_has_its_spectrum_and_the_level_of_its_kind(tmp_path, rate, 
     assert power[(hz > 900.0) & (hz < 1100.0)].sum() > 0.98 * power.sum()
 
 
-def test_a_short_recording_goes_on_and_a_pause_stays_one(tmp_path):
+def test_short_recordings_are_repeated_and_pauses_kept(tmp_path):
     folder = folder_of(tmp_path, "dog", band_noise(0.3, 16_000), 16_000)
     heard = emitted(SOUNDS["dog"], 24_000, 8_000.0, np.random.default_rng(2), folder)
     assert np.square(heard).reshape(-1, 800).mean(axis=1).min() > 0.0
@@ -61,7 +61,7 @@ def test_a_short_recording_goes_on_and_a_pause_stays_one(tmp_path):
     assert np.median(levels) < 1e-2 * (REFERENCE_PA * 10.0 ** (SOUNDS["dog"].level_db / 20.0)) ** 2
 
 
-def test_a_kind_without_recordings_is_synthesised_as_before(tmp_path):
+def test_a_kind_without_recordings_is_synthesised(tmp_path):
     folder = folder_of(tmp_path, "dog", band_noise(2.0, 16_000), 16_000)
     with_folder, without = (
         emitted(SOUNDS["horn"], 8_000, 8_000.0, np.random.default_rng(3), one) for one in (folder, "")
@@ -69,8 +69,8 @@ def test_a_kind_without_recordings_is_synthesised_as_before(tmp_path):
     assert with_folder.tobytes() == without.tobytes()
 
 
-def test_a_recording_is_carried_by_the_street(tmp_path):
-    """Its line stands 20 dB above the same street without it, later by the way at each microphone."""
+def test_a_recorded_sound_propagates_through_the_street(tmp_path):
+    """Its line is 20 dB above the street, delayed by the path to each microphone."""
     folder = folder_of(tmp_path, "tone", band_noise(4.0, 16_000), 16_000)
     street = SimulationSettings(site("SB1"), "none", duration_s=2.0, sample_rate_hz=6_000.0)
     sounding = replace(
@@ -88,7 +88,7 @@ def test_a_recording_is_carried_by_the_street(tmp_path):
     assert (loud[beside].sum(axis=0) < 2.0 * quiet[beside].sum(axis=0)).all()
 
 
-def test_folders_are_named_as_kinds_and_hold_sound(tmp_path):
+def test_folders_of_recordings_have_the_names_of_kinds(tmp_path):
     folder = folder_of(tmp_path / "good", "siren", band_noise(0.3, 16_000), 16_000)
     (tmp_path / "good" / ".git").mkdir()
     assert recorded_kinds(folder) == ("siren",)
@@ -104,7 +104,7 @@ def test_folders_are_named_as_kinds_and_hold_sound(tmp_path):
         recorded_kinds(str(tmp_path / "good" / ".git"))
 
 
-def test_the_command_takes_a_folder_among_the_kinds(tmp_path, capsys):
+def test_the_command_accepts_a_folder_among_the_kinds(tmp_path, capsys):
     write_array_xml(tmp_path / "pair.xml", PAIR)
     folder = folder_of(tmp_path / "own", "voice", band_noise(2.0, 16_000), 16_000)
     command = ["sim", "make", "--static", "1", "--duration", "0.5", "--bandwidth", "2000"]

@@ -1,4 +1,4 @@
-"""Rendered streets: what hides what, when, and whether a motion detector finds the vehicle and loses it."""
+"""Rendered streets: occlusion, times and motion detection."""
 
 import sys
 from dataclasses import replace
@@ -62,12 +62,12 @@ def filmed(plan, seed=3, camera=SMALL):
 
 
 def changed(frame, other, by=25):
-    """Pixels in which two frames differ by far more than the sensor's noise."""
+    """Return the pixels in which two frames differ by much more than sensor noise."""
     return np.abs(frame.astype(int) - other.astype(int)).max(axis=2) > by
 
 
 def opencv_pixels(camera, points):
-    """Project by OpenCV's own pinhole model, (n, 3) to (n, 2)."""
+    """Project by the pinhole model of OpenCV, (n, 3) to (n, 2)."""
     pitch = camera.pitch_rad
     rows = [[0, -1, 0], [np.sin(pitch), 0, -np.cos(pitch)], [np.cos(pitch), 0, np.sin(pitch)]]
     turn = np.array(rows, float)
@@ -77,7 +77,7 @@ def opencv_pixels(camera, points):
     return cv2.projectPoints(points, cv2.Rodrigues(turn)[0], shift, lens, None)[0][:, 0]
 
 
-def test_rays_are_those_of_opencv():
+def test_rays_equal_those_of_opencv():
     view = View(SMALL)
     rays = view.rays(view.whole)
     chosen = np.random.default_rng(0).integers(0, (402, 640), (50, 2))
@@ -88,8 +88,8 @@ def test_rays_are_those_of_opencv():
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_a_solid_is_met_where_sampling_says(seed):
-    """Oracle: march along the ray in small steps and look when all half-spaces hold."""
+def test_intersections_equal_those_by_sampling(seed):
+    """Oracle: small steps along the ray until all half-spaces contain the point."""
     rng = np.random.default_rng(seed)
     normals = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(3, 3))])
     offsets = rng.uniform(0.4, 1.0, 9)
@@ -109,7 +109,7 @@ def test_a_solid_is_met_where_sampling_says(seed):
     assert np.abs((met * normals[face[both]]).sum(axis=1) - offsets[face[both]]).max(initial=0.0) < 1e-4
 
 
-def test_the_nearer_panel_hides_the_farther_in_any_order():
+def test_nearer_panels_hide_farther_ones_in_any_order():
     view = View(PinholeCamera.ovad(width_px=8, height_px=6, pitch_rad=0.0))
 
     def plain(colour):
@@ -123,7 +123,7 @@ def test_the_nearer_panel_hides_the_farther_in_any_order():
         assert depth == pytest.approx(3.567, abs=1e-3)
 
 
-def test_patch_holds_the_projection():
+def test_a_patch_contains_the_projection():
     points = np.array([[6.0, 1.0, -1.7], [7.0, -1.0, -0.2]])
     patch = View(SMALL).around(points)
     pixels = opencv_pixels(SMALL, points)
@@ -138,7 +138,7 @@ def test_patch_holds_the_projection():
 
 
 def test_a_car_fills_the_projection_of_its_cuboid():
-    """In the open, seen by its colour: the silhouette's box against OpenCV's projection of the corners."""
+    """The bounding box of its colour in the open against the projected corners by OpenCV."""
     street = paint_street(site("SB1"), View(MIDDLE))
     still = street.pixels()
     image = still.copy()
@@ -160,7 +160,7 @@ def test_a_car_fills_the_projection_of_its_cuboid():
 
 
 def test_a_mirrored_car_in_the_middle_mirrors_the_change():
-    """Site and camera made symmetric: left is the mirror image of right."""
+    """Site and camera are symmetric, so left is the mirror image of right."""
     camera = replace(SMALL, position_m=(-0.567, 0.0, -0.485))
     plan = site("SB1")
     plan = replace(plan, corner_right_m=plan.corner_left_m, side_wall_right_m=plan.side_wall_left_m)
@@ -178,7 +178,7 @@ def test_a_mirrored_car_in_the_middle_mirrors_the_change():
 @pytest.mark.long
 @pytest.mark.parametrize("name", SITES)
 @pytest.mark.parametrize("approach", ["left", "right"])
-def test_nothing_moves_before_line_of_sight_and_then_it_does(name, approach):
+def test_images_change_only_from_line_of_sight(name, approach):
     plan = scene(name, approach, duration_s=3.0)
     recording, frames = filmed(plan)
     t0 = recording.t0_frame
@@ -191,7 +191,7 @@ def test_nothing_moves_before_line_of_sight_and_then_it_does(name, approach):
     assert (columns.mean() < 160) == (approach == "left")
 
 
-def test_an_empty_street_stands_still_but_for_noise():
+def test_images_of_an_empty_street_differ_only_by_noise():
     recording, frames = filmed(scene(approach="none", duration_s=1.0))
     assert not recording.truth["frames"]
     difference = frames[0].astype(float) - frames[5]
@@ -202,7 +202,7 @@ def test_an_empty_street_stands_still_but_for_noise():
     assert not np.array_equal(frames[0], frames[1])
 
 
-def test_same_seed_same_frames_another_seed_another_noise():
+def test_frames_are_reproducible_by_seed():
     plan = scene(duration_s=0.6, entry_s=0.3)
     first, again, other = (filmed(plan, seed)[1] for seed in (3, 3, 4))
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
@@ -211,7 +211,7 @@ def test_same_seed_same_frames_another_seed_another_noise():
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(SITES))
-def test_the_parked_car_is_read_back_from_its_boxes(seed, name):
+def test_the_position_of_the_parked_car_follows_from_its_boxes(seed, name):
     from worldstate.simulation.camera.simulated_detector import park
 
     rng = np.random.default_rng(seed)
@@ -223,7 +223,7 @@ def test_the_parked_car_is_read_back_from_its_boxes(seed, name):
     assert found == pytest.approx(middle, abs=0.25)
 
 
-def test_the_parked_car_stands_in_its_box():
+def test_the_parked_car_is_drawn_in_its_box():
     plan = scene("SB1", "none", duration_s=1.0, parked_car=True)
     rng = np.random.default_rng(4)
     recording = simulate_recording(plan, rng, PAIR)
@@ -242,12 +242,12 @@ def test_the_parked_car_stands_in_its_box():
 
 @pytest.fixture(scope="module")
 def passing():
-    """A car through the picture in a second and a half, as large as the camera takes it."""
+    """Return a car that crosses the image in 1.5 s, as large as the camera allows."""
     return filmed(scene("SB2", "right", duration_s=2.0, entry_s=1.0), camera=PinholeCamera.ovad())
 
 
 def missed(frames, recording, camera, family, d, seed=0):
-    """Share of frames with a box in which a fresh motion detector has none with IoU >= .3."""
+    """Return the share of frames with a box in which a fresh motion detector has IoU below 0.3."""
     detector, rng, looks, misses = MotionDetector(), np.random.default_rng(seed), 0, 0
     for number, frame in enumerate(frames):
         found = detector.detect(degrade(frame, family, d, rng))
@@ -261,8 +261,8 @@ def missed(frames, recording, camera, family, d, seed=0):
 
 @pytest.mark.long
 @pytest.mark.parametrize("family", ["blur", "darkness", "noise"])
-def test_a_motion_detector_finds_the_vehicle_and_loses_it_in_each_family(family, passing):
-    """Levels are those of the camera's own size, and blur is in pixels: the picture must be that large."""
+def test_a_motion_detector_loses_the_vehicle_in_degraded_frames(family, passing):
+    """Levels and blur in pixels are those of the full image size."""
     recording, frames = passing
     rates = [missed(frames, recording, PinholeCamera.ovad(), family, d) for d in (0.25, 1.0)]
     assert rates[0] <= 0.2
@@ -275,7 +275,7 @@ def test_a_motion_detector_finds_the_vehicle_in_clean_frames(passing):
     assert missed(frames, recording, PinholeCamera.ovad(), "blur", 0.0) <= 0.1
 
 
-def test_video_comes_back_as_written(tmp_path):
+def test_video_reads_back_as_written(tmp_path):
     _, frames = filmed(scene(duration_s=0.6, entry_s=0.3), camera=MIDDLE)
     write_video(tmp_path / "v.mp4", frames)
     video = open_video(tmp_path / "v.mp4")
@@ -286,7 +286,7 @@ def test_video_comes_back_as_written(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["v.mp4"]
 
 
-def test_video_refuses_nothing_and_nowhere(tmp_path):
+def test_video_without_frames_or_folder_raises_an_error(tmp_path):
     frame = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(InvalidArgumentError, match="frames"):
         write_video(tmp_path / "v.mp4", [])
@@ -300,7 +300,7 @@ def test_without_opencv_the_extra_is_named(tmp_path, monkeypatch):
         write_video(tmp_path / "v.mp4", [np.zeros((16, 16, 3), np.uint8)])
 
 
-def test_the_video_lies_beside_the_sound_with_the_same_bytes_again(tmp_path):
+def test_the_video_is_written_beside_the_sound_reproducibly(tmp_path):
     plan = scene(duration_s=0.5, entry_s=0.3)
     recording = simulate_recording(plan, np.random.default_rng(3), PAIR)
     for name in "abc":

@@ -1,4 +1,4 @@
-"""What an empty street sounds like: diffuse fields as coherent as textbooks say, a face that a site keeps."""
+"""The sound of an empty street: coherence of diffuse fields and the constant background of a site."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ FS = 8000.0
 
 
 def field(seconds: float, offsets_m: np.ndarray, noise: float = 0.0) -> WaveField:
-    """A field from 72 directions round the horizon, 1 Pa^2/Hz in all, and noise of each microphone."""
+    """Return a field of 72 directions, 1 Pa^2/Hz in all, with independent noise of each microphone."""
     grid, azimuth = BlockGrid(round(seconds * FS), FS), 2.0 * np.pi * np.arange(72) / 72
     delays = plane_wave_delays(unit_vectors(azimuth, np.zeros(72)), offsets_m)
     bins, blocks = len(grid.frequencies_hz), len(grid.middles_s)
@@ -51,8 +51,8 @@ def heard(one: WaveField, seed: int = 1) -> np.ndarray:
     return out
 
 
-def test_sound_from_all_round_is_as_coherent_as_the_bessel_function_says():
-    """Two dimensions, diffuse: coherence J0(kd), and with as much noise beside it half of that."""
+def test_a_diffuse_field_has_the_coherence_of_a_bessel_function():
+    """A diffuse field in two dimensions has J0(kd); equal independent noise halves it."""
     distance_m = 0.25
     for noise, share in ((0.0, 1.0), (1.0, 0.5)):
         pair = heard(field(12.0, np.array([[0.0, 0.0, 0.0], [0.0, distance_m, 0.0]]), noise))
@@ -65,7 +65,7 @@ def test_sound_from_all_round_is_as_coherent_as_the_bessel_function_says():
         assert np.abs(power[0][band].mean() - (1.0 + noise)) < 0.03 * (1.0 + noise)
 
 
-def test_the_level_is_the_same_at_every_sample_however_the_blocks_lie():
+def test_the_level_is_constant_within_and_between_blocks():
     one = replace(field(60.0, np.zeros((1, 3))), delays_s=np.zeros((1, 1)))
     sound = heard(replace(one, power=np.ones((len(one.power), 1))))[0]
     hop = one.grid.hop
@@ -74,14 +74,14 @@ def test_the_level_is_the_same_at_every_sample_however_the_blocks_lie():
     assert folded.std() < 0.05 * folded.mean()  # a window whose squares do not add up to one: .35
 
 
-def test_stretches_are_what_is_added_at_once():
+def test_a_field_in_pieces_equals_one_rendered_at_once():
     one = field(3.1, np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]]), 0.3)
     parts = np.concatenate(list(one.stretches(np.random.default_rng(1))), axis=1)
     assert np.array_equal(parts[:, : one.grid.samples], heard(one))
 
 
-def test_flicker_changes_octaves_by_its_deviation_and_not_their_mean_level():
-    """Against levels of band-passed sound: deviation, what octaves share, and how fast it is over."""
+def test_flicker_has_its_deviation_and_keeps_the_mean_level():
+    """Levels of band-passed sound: deviation, share common to octaves and correlation time."""
     seconds, deviation_db, step = 240.0, 3.0, 0.04
     one = replace(field(seconds, np.zeros((1, 3))), flicker_db=deviation_db)
     still, flickering = (
@@ -116,7 +116,7 @@ def empty_window(name: str, seed: int, levels=None) -> np.ndarray:
     return published_feature(out.T, ovad_array(), RATE_HZ)
 
 
-def test_a_site_keeps_its_face_from_recording_to_recording():
+def test_a_site_has_the_same_background_in_every_recording():
     calm, names = replace(preset(), far_rate=0.0, sky_share=0.2), ("SA1", "SB1", "SB2")
     log = np.log([[empty_window(name, seed, calm) for seed in range(4)] for name in names])
     pattern = log - log.mean(axis=2, keepdims=True)
@@ -125,7 +125,7 @@ def test_a_site_keeps_its_face_from_recording_to_recording():
     assert between > 1.5 * alone
 
 
-def test_a_town_all_round_has_no_direction_and_a_street_has():
+def test_the_background_of_a_street_has_directions():
     everywhere = replace(preset(), sky_share=1.0, far_rate=0.0, wave_fluctuation_db=0.0, wind_100hz_db=20.0)
     flat, street = (
         np.log([empty_window("SB1", seed, one) for seed in range(3)]).std(axis=1).mean()
@@ -134,7 +134,7 @@ def test_a_town_all_round_has_no_direction_and_a_street_has():
     assert 1.5 * flat < street
 
 
-def test_arms_of_a_symmetric_street_mirror_each_other_and_none_has_a_corner_in_the_open():
+def test_arms_of_a_symmetric_street_are_mirror_images():
     even = Site("SB1", 2.8, 2.8, 4.5, None, 3.0, 3.0, 6.0)
     (left, loud), (right, as_loud), *_ = opening_images(even)
     order, other = np.argsort(left), np.argsort(-right)
@@ -143,7 +143,7 @@ def test_arms_of_a_symmetric_street_mirror_each_other_and_none_has_a_corner_in_t
     assert np.degrees(opening_images(place("merge").site)[0][0]).tolist() == [90.0]
 
 
-def test_a_wall_opposite_keeps_out_what_comes_from_ahead():
+def test_an_opposite_wall_shields_from_ahead():
     walled, open_ = (
         site_ambience(replace(site("SA1"), opposite_wall_m=wall), preset()) for wall in (9.9, None)
     )
@@ -151,7 +151,7 @@ def test_a_wall_opposite_keeps_out_what_comes_from_ahead():
     assert np.array_equal(walled.octaves_db, open_.octaves_db)
 
 
-def test_an_engine_is_louder_when_it_accelerates_and_quieter_when_pushed():
+def test_an_engine_is_louder_under_load():
     time = np.arange(0.0, 6.0, 0.01)
     acceleration = np.where(time < 2.0, 0.0, np.where(time < 4.0, 1.5, -0.5))
     speed = 5.0 + np.cumsum(acceleration) * 0.01
@@ -160,7 +160,7 @@ def test_an_engine_is_louder_when_it_accelerates_and_quieter_when_pushed():
     assert np.abs(np.diff(change)).max() < 0.5  # no click
 
 
-def test_walls_give_back_the_own_sound_from_the_sides_and_louder_when_they_are_near():
+def test_near_walls_reflect_the_own_sound_louder():
     azimuth = np.radians(np.arange(-180.0, 180.0, 5.0))
     near = replace(site("DB1"), side_wall_left_m=2.8, side_wall_right_m=2.8)
     far = replace(near, side_wall_left_m=5.6, side_wall_right_m=5.6)
@@ -172,7 +172,7 @@ def test_walls_give_back_the_own_sound_from_the_sides_and_louder_when_they_are_n
 
 
 @pytest.mark.parametrize("where", ["street", "open"])
-def test_an_ego_in_the_open_has_no_echo_and_one_that_stops_falls_silent(where):
+def test_own_sound_has_no_echo_in_the_open_and_ends_at_the_stop(where):
     plan = site("DB1") if where == "street" else place("merge").site
     knots = np.arange(251) * KNOT_SAMPLES / FS
     receiver = Receiver(np.zeros((1, 3)), np.zeros(1), knots, EgoMotion(6.0, knots[-1] - 1.0))
@@ -182,8 +182,8 @@ def test_an_ego_in_the_open_has_no_echo_and_one_that_stops_falls_silent(where):
     assert before > 10.0 * after if where == "street" else not out.any()
 
 
-def test_a_rough_road_is_heard_from_under_the_ego_and_from_its_walls():
-    """Tyres alone grow with the road; at 8 m/s they are most of what the walls give back."""
+def test_a_rough_road_raises_tyre_noise_and_its_echo():
+    """Only tyres grow with roughness; at 8 m/s they dominate the echo."""
     knots = np.arange(251) * KNOT_SAMPLES / FS
     receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), knots, EgoMotion(8.0, 60.0))
     speed = np.full(receiver.samples, 8.0)
@@ -201,7 +201,7 @@ def test_a_rough_road_is_heard_from_under_the_ego_and_from_its_walls():
 
 
 def passing(surface_db: float, bass_db: float) -> np.ndarray:
-    """Levels of one and the same vehicle in the open, in the octaves of 125 Hz and 1 kHz."""
+    """Return levels of one vehicle in the open in the octaves of 125 Hz and 1 kHz."""
     plan = replace(place("merge").site, occluders=(), in_the_open=True, surface_db=surface_db)
     levels = replace(preset(), vehicle_spread_db=0.0, engine_spread_db=0.0, engine_bass_db=bass_db)
     knots = np.arange(126) * KNOT_SAMPLES / FS
@@ -216,13 +216,13 @@ def passing(surface_db: float, bass_db: float) -> np.ndarray:
     return 10.0 * np.log10(bands)
 
 
-def test_a_rough_road_makes_tyres_louder_and_no_engine():
+def test_a_rough_road_raises_tyres_and_not_engines():
     change_db = passing(8.0, 0.0) - passing(0.0, 0.0)
     assert change_db[0] < 2.5  # at 20 km/h the engine has the octave of 125 Hz to itself
     assert change_db[1] == pytest.approx(8.0, abs=1.0)
 
 
-def test_engines_lose_their_bass_and_nothing_else():
+def test_bass_level_changes_only_the_bass():
     change_db = passing(0.0, -12.0) - passing(0.0, 0.0)
     assert change_db[0] < -6.0
     assert change_db[1] == pytest.approx(0.0, abs=0.3)

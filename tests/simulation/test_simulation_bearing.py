@@ -1,4 +1,4 @@
-"""Where a hidden vehicle is heard: at the corner behind a screen, at the side walls in a street."""
+"""Directions of a hidden vehicle: the corner behind a screen, the side walls in a street."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ QUIET = replace(
 
 
 def loudest_deg(plan: Site, approach: str, seed: int, levels=QUIET) -> np.ndarray:
-    """Direction of the largest SRP in windows of 0.25 s of a hidden approach, degrees, left positive."""
+    """Return the direction of the largest SRP per 0.25 s of a hidden approach, degrees, left positive."""
     scene = SimulationSettings(
         plan, approach, duration_s=1.5, entry_s=1.5, speed_mps=8.0, sample_rate_hz=RATE_HZ, preset=levels
     )
@@ -46,15 +46,15 @@ def loudest_deg(plan: Site, approach: str, seed: int, levels=QUIET) -> np.ndarra
 
 
 @pytest.mark.parametrize(("approach", "aside", "ahead"), [("left", 2.8, 4.45), ("right", 2.2, 6.0)])
-def test_behind_a_screen_alone_the_vehicle_is_heard_at_the_corner(approach, aside, ahead):
+def test_behind_a_screen_the_loudest_direction_is_the_corner(approach, aside, ahead):
     plan = Site("Screen1", aside, aside, ahead, None, aside, aside, 6.0, side_order=0, facade_order=0)
     corner = np.degrees(np.arctan2(aside, ahead)) * (1 if approach == "left" else -1)
     assert np.abs(loudest_deg(plan, approach, 1) - corner).max() <= 3.0
 
 
 @pytest.mark.parametrize("approach", ["left", "right"])
-def test_side_walls_move_it_away_from_the_corner(approach):
-    """A street with mirrors for walls: heard at lateral images, now on the one side and now on the other."""
+def test_side_walls_move_the_loudest_direction_from_the_corner(approach):
+    """With mirrors for walls the loudest direction is a lateral image on either side."""
     plan = replace(site("SB1"), side_reflection=0.9)
     found = loudest_deg(plan, approach, 2) * (1 if approach == "left" else -1)
     assert np.mean(np.abs(found) > 40.0) >= 0.8
@@ -64,7 +64,7 @@ def test_side_walls_move_it_away_from_the_corner(approach):
 
 @pytest.mark.slow
 def test_in_the_full_scene_most_hidden_windows_peak_at_the_sides():
-    """At least 60 % beyond 40 degrees over the five sites, as 75 % of the real ones at 42 to 63."""
+    """At least 60 % beyond 40 degrees over the five sites; in real recordings 75 % are at 42 to 63."""
     table, _ = simulated_window_pair(6, seed=3)
     spectra = table.features.reshape(len(table), 2, -1).mean(axis=1)
     beyond = np.abs(np.degrees(FEATURE_AZIMUTHS_RAD[spectra.argmax(axis=1)])) > 40.0

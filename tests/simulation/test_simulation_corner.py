@@ -1,4 +1,4 @@
-"""What passes a building's corner and what its street's walls reflect, against closed forms."""
+"""Diffraction at a corner and reflections of street walls against closed forms."""
 
 import numpy as np
 import pytest
@@ -20,8 +20,8 @@ C = SPEED_OF_SOUND_MPS
 
 
 @given(letter=st.sampled_from(["SA", "SB", "TA", "TB", "MA", "MB"]), number=st.integers(101, 999_999))
-def test_a_vehicle_comes_out_of_a_drawn_arm_at_the_corner(letter: str, number: int) -> None:
-    """At the edge of the image it would be in line of sight of the microphones for seconds before its T0."""
+def test_vehicles_of_drawn_arms_appear_at_the_corner(letter: str, number: int) -> None:
+    """Entry at the edge of the image would give line of sight seconds before T0."""
     place = drawn_site(f"{letter}{number}")
     for approach, lane, corner in zip(
         ("left", "right"), place.lanes_m, (place.corner_left_m, place.corner_right_m), strict=True
@@ -48,8 +48,8 @@ def rigid_wedge_db(r, angle, r0, angle0):
 
 @pytest.mark.parametrize("shadow_deg", [1.0, 5.0, 20.0, 45.0, 75.0])
 @pytest.mark.parametrize(("r", "r0"), [(5.3, 5.4), (8.4, 14.0)])
-def test_a_corner_with_its_wall_is_the_rigid_wedge(r, r0, shadow_deg):
-    """The wave round the edge and the one that its wall mirrors have equal ways and add up."""
+def test_a_corner_and_its_wall_equal_a_rigid_wedge(r, r0, shadow_deg):
+    """The diffracted wave and its mirror image in the wall have equal lengths and add up."""
     angle0 = np.radians(12.0)
     angle = np.pi + angle0 + np.radians(shadow_deg)
     turns = np.array([angle - angle0, 2.0 * EXTERIOR_RAD - angle - angle0])
@@ -58,8 +58,8 @@ def test_a_corner_with_its_wall_is_the_rigid_wedge(r, r0, shadow_deg):
 
 
 @pytest.mark.parametrize("y", [4.6, 6.0, 20.0])
-def test_a_rendered_corner_is_the_rigid_wedge(y):
-    """A rigid wall up to the corner and nothing else, a standing source up to 60 degrees behind it."""
+def test_a_rendered_corner_equals_a_rigid_wedge(y):
+    """One rigid wall up to the corner and a static source up to 60 degrees behind it."""
     site = Site(
         "Wedge", 2.8, 30.0, 4.45, None, 2.8, 30.0, 6.0, 0.98, side_order=1, right_openings_m=((-99.0, 99.0),)
     )
@@ -92,7 +92,7 @@ def test_the_corner_is_continuous_through_the_shadow_boundary(frequency, reduced
 
 
 @given(st.floats(3.0, 40.0), st.floats(0.5, 15.0), st.floats(-40.0, 40.0))
-def test_what_is_lit_goes_straight_and_what_is_hidden_goes_round(corner, beyond, y):
+def test_paths_are_straight_in_view_and_bent_when_hidden(corner, beyond, y):
     site = Site("SB1", min(corner, 30.0), 2.5, 4.0, None, 3.0, 3.0, 6.0)
     passage = through_mouth(site, (4.0 + beyond, np.array([y])), (0.0, 0.0), 1.0)
     lit = passage.clearance_m[0] > 0.0
@@ -101,7 +101,7 @@ def test_what_is_lit_goes_straight_and_what_is_hidden_goes_round(corner, beyond,
 
 
 @given(st.floats(-3.0, 3.0), st.floats(0.2, 3.0), st.floats(4.5, 30.0))
-def test_an_opening_takes_the_reflections_that_meet_it(begin, length, y):
+def test_an_opening_removes_the_reflections_on_it(begin, length, y):
     """A source at (7, y) and a wall at -2.8 m: the reflection point by similar triangles."""
     opening = (begin, begin + length)
     plan = {"corner_left_m": 12.0, "corner_right_m": 12.0, "corner_ahead_m": 4.0, "opposite_wall_m": None}
@@ -121,7 +121,7 @@ def test_an_opening_takes_the_reflections_that_meet_it(begin, length, y):
 
 
 @given(st.floats(1.5, 3.5), st.floats(4.0, 7.0), st.floats(2.0, 8.0), st.floats(0.1, 40.0))
-def test_a_hidden_vehicle_is_lit_by_one_image_after_another(aside, ahead, lane, y):
+def test_images_of_a_hidden_vehicle_follow_one_another(aside, ahead, lane, y):
     """Between walls w to either side the image of order n stands at atan((2 n w + y) / (D + l)).
 
     It is lit from atan((2 n - 1) w / D) to atan((2 n + 1) w / D): with hard walls what is heard of a vehicle
@@ -140,8 +140,8 @@ def test_a_hidden_vehicle_is_lit_by_one_image_after_another(aside, ahead, lane, 
 
 
 @pytest.mark.parametrize("name", SITES)
-def test_no_side_wall_stands_before_its_corner(name):
-    """What reflects is seen: a wall in the line of sight to its corner would hide the street."""
+def test_side_walls_do_not_hide_their_corner(name):
+    """A wall in the line of sight to its corner would hide the street."""
     plan = site(name)
     for wall, corner, openings in (
         (plan.side_wall_left_m, plan.corner_left_m, plan.left_openings_m),

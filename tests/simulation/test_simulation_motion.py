@@ -1,4 +1,4 @@
-"""A moving ego, a turning vehicle and bodies in the open: Doppler, no clicks, blocks and truth."""
+"""A moving ego, a turning vehicle and bodies in the open: Doppler shift, continuity and truth."""
 
 import json
 from dataclasses import replace
@@ -69,8 +69,8 @@ def instantaneous_hz(x: np.ndarray, f: float, step: int = 480) -> tuple[np.ndarr
     )
 
 
-def test_a_moving_ego_hears_the_doppler_of_its_own_speed():
-    """f = f0 (1 + v cos(theta) / c) for a source that stands still, within the issue's 1e-4."""
+def test_a_moving_ego_has_the_doppler_shift_of_its_speed():
+    """f = f0 (1 + v cos(theta) / c) for a static source, within 1e-4."""
     ego, place = EgoMotion(8.0, 10.0), np.array([20.0, 3.0, 0.3])
     receiver = listener(2.0, ego)
     sound = emission(receiver, tone(1000.0))
@@ -88,8 +88,8 @@ def test_a_moving_ego_hears_the_doppler_of_its_own_speed():
     assert expected.min() > 1020.0
 
 
-def test_a_place_that_stands_still_is_heard_from_where_it_is():
-    """Spread over the microphones of a moving ego: each hears the tone after its own changing distance."""
+def test_a_static_source_keeps_its_place_for_a_moving_ego():
+    """Each microphone of a moving ego has the tone of its own changing distance."""
     ego, place = EgoMotion(6.0, 10.0), np.array([6.0, 2.5, 1.7])
     receiver = listener(2.0, ego, ((0.3, 0.0, 1.7), (-0.3, 0.0, 1.7)))
     time = np.arange(receiver.samples) / FS
@@ -102,8 +102,8 @@ def test_a_place_that_stands_still_is_heard_from_where_it_is():
         assert error_db < -50.0
 
 
-def test_patches_that_are_left_out_are_not_missed(monkeypatch):
-    """Below the threshold lies less than 2 % of what rough walls send on while the ego drives past them."""
+def test_omitted_wall_patches_have_little_energy(monkeypatch):
+    """Patches below the threshold send less than 2 % of the energy of rough walls past a driving ego."""
     ego = EgoMotion(6.0, 2.0)
     receiver = listener(2.5, ego, ((0.0, 0.2, 1.7), (0.0, -0.2, 1.7)))
     sound = emission(receiver, noise)
@@ -150,8 +150,8 @@ def heard(scene: SimulationSettings, sound) -> np.ndarray:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SHOWN)
-def test_nothing_clicks_while_paths_come_and_go(name):
-    """A 500-Hz tone stays one (Doppler aside): a click would spread beyond 2 kHz."""
+def test_paths_of_a_moving_ego_change_without_clicks(name):
+    """A click would spread a 500-Hz tone beyond 2 kHz."""
     sound = heard(SCENES[name](), tone(500.0))
     assert np.isfinite(sound).all()
     spectrum = np.abs(np.fft.rfft(sound * np.hanning(len(sound)))) ** 2
@@ -169,7 +169,7 @@ def test_energy_is_continuous_through_the_whole_recording_and_line_of_sight_entr
 
 
 @pytest.mark.long
-def test_truth_tells_ways_sight_and_time_of_every_vehicle():
+def test_truth_has_route_sight_and_time_of_every_vehicle():
     others = (
         VehicleSettings("right", 4.0, 9.0, kind="heavy"),
         VehicleSettings("left", 9.0, manoeuvre="turn"),
@@ -198,8 +198,8 @@ def test_truth_tells_ways_sight_and_time_of_every_vehicle():
     assert recording.detections == ()
 
 
-def test_the_ego_s_own_noise_follows_its_speed():
-    """Tyres, 500 Hz to 2 kHz: far louder than an empty street while it drives, gone when it stops."""
+def test_own_noise_follows_the_speed():
+    """Tyres from 500 Hz to 2 kHz exceed an empty street while driving and end at the stop."""
     ego = EgoMotion(8.0, 3.0)
     # A distant vehicle would be a noise that does not follow, and a loud town hides what does.
     calm = replace(preset(), far_rate=0.0, ambient_octaves_db=(45.0,) * 8)

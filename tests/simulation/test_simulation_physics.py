@@ -1,4 +1,4 @@
-"""Physics of the simulator against closed forms and another package."""
+"""Physics of the simulator against closed forms and Acoular."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ FREE_FIELD = Site("Free1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, side_order=0
 
 
 def add_sources(out, *arguments):
-    """Add sources and whatever waits."""
+    """Add sources and pending blocks."""
     static = StaticSources(out, FS)
     propagation.add_sources(static, *arguments)
     static.render()
@@ -51,7 +51,7 @@ def free_field(signal: np.ndarray, y_of_t, lane: float, positions: np.ndarray, s
 
 
 def tone_phase(x: np.ndarray, f: float) -> np.ndarray:
-    """Unwrapped phase of a slowly shifting tone, band-passed around f."""
+    """Return the unwrapped phase of a slowly shifting tone, band-passed around f."""
     spectrum = np.fft.fft(x)
     frequencies = np.fft.fftfreq(len(x), 1 / FS)
     spectrum[np.abs(frequencies - f) > 0.2 * f] = 0.0
@@ -98,8 +98,8 @@ def test_emission_times_solve_the_retarded_time_equation(speed, lane, y0):
     np.testing.assert_allclose(found + np.hypot(lane, y0 + speed * found) / C, receive, rtol=0.0, atol=6e-7)
 
 
-def test_doppler_is_that_of_the_retarded_position():
-    """f = f0 / (1 + v_r / c) with v_r at emission time; the tolerance is the issue's 1e-4."""
+def test_the_doppler_shift_is_that_of_the_retarded_position():
+    """f = f0 / (1 + v_r / c) with v_r at emission time, within 1e-4."""
     f0, speed, lane, blocks = 1000.0, 13.0, 6.0, 750
     start, n = -0.5, (blocks + 400) * KNOT_SAMPLES
     time = start + np.arange(n) / FS
@@ -120,7 +120,7 @@ def test_doppler_is_that_of_the_retarded_position():
 
 
 def acoular_signal(acoular, samples):
-    """Hand samples of our own to acoular, which brings its own resampling."""
+    """Return a signal of Acoular with given samples, with its own resampling."""
 
     class Samples(acoular.SignalGenerator):
         def signal(self):
@@ -132,7 +132,7 @@ def acoular_signal(acoular, samples):
     return Samples(sample_freq=FS, num_samples=len(samples))
 
 
-def test_free_field_waveform_is_that_of_acoular():
+def test_free_field_waveform_equals_acoular():
     acoular = pytest.importorskip("acoular")
     speed, lane, y0, seconds = 13.0, 6.0, -9.0, 1.2
     n = int(seconds * FS)
@@ -165,8 +165,8 @@ def test_free_field_waveform_is_that_of_acoular():
 
 
 @pytest.mark.parametrize(("fresnel", "maekawa_db"), [(0.1, 8.0), (1.0, 13.0), (10.0, 23.0)])
-def test_screen_formula_follows_maekawas_chart(fresnel, maekawa_db):
-    """Maekawa (1968): 13 dB at N = 1, 10 log10(20 N) beyond; 8 dB read off the chart at N = 0.1."""
+def test_screen_attenuation_equals_the_chart_of_maekawa(fresnel, maekawa_db):
+    """Maekawa (1968): 13 dB at N = 1, 10 log10(20 N) beyond; 8 dB on the chart at N = 0.1."""
     detour = np.array([fresnel * C / 2000.0])
     assert screen_attenuation_db(detour, np.array(1000.0), 60.0)[0] == pytest.approx(maekawa_db, abs=1.5)
 

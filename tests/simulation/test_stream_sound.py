@@ -1,4 +1,4 @@
-"""Sound of a stream: events add up, levels rise, no seams, the same bytes, bounded memory."""
+"""Sound of a stream: sum of events, levels, seams, determinism and bounded memory."""
 
 import csv
 import json
@@ -67,7 +67,7 @@ def sound_of(scene: StreamScene, events: Sequence[Event]) -> Float32Array:
     return np.concatenate([block.pressure_pa for block in render_blocks(scene, events)], axis=1)
 
 
-def test_a_stream_is_its_background_and_the_sum_of_its_events_rendered_apart() -> None:
+def test_a_stream_is_the_sum_of_background_and_events() -> None:
     scene = scene_of(36.0 / 60.0, rate_hz=3000.0)
     # The first began before the stream, the second and third overlap over the edge of a piece (30 s), the
     # last goes on after the end.
@@ -87,10 +87,8 @@ def test_a_stream_is_its_background_and_the_sum_of_its_events_rendered_apart() -
 
 @pytest.mark.parametrize("where", ["SB1", "TA1"])
 @pytest.mark.parametrize("level_db", [-17.0, 5.0])
-def test_a_background_so_many_decibels_up_is_the_same_sound_as_much_louder(
-    where: str, level_db: float
-) -> None:
-    """But for the electronic noise, which does not follow the street."""
+def test_the_background_level_scales_the_background(where: str, level_db: float) -> None:
+    """Electronic noise does not follow the level of the street."""
     silent = replace(preset(), self_noise_db=0.0, ambient_waves=8)
     traffic = Traffic("test", {}, background_db=(level_db, level_db))
     usual = StreamSettings(junction_named(where), 0.2, 5, replace(traffic, background_db=(0.0, 0.0)), silent)
@@ -102,7 +100,7 @@ def test_a_background_so_many_decibels_up_is_the_same_sound_as_much_louder(
     np.testing.assert_allclose(heard[1], factor * heard[0], rtol=2e-3, atol=1e-4 * np.abs(heard[1]).max())
 
 
-def test_rain_falls_throughout_a_stream_without_a_seam_and_is_common_to_no_two_microphones() -> None:
+def test_rain_of_a_stream_is_continuous_and_incoherent() -> None:
     dry = StreamSettings(site("SB1"), 1.2, 4, Traffic("test", {}), STILL, 3000.0)
     raining = next(
         one
@@ -127,7 +125,7 @@ def test_rain_falls_throughout_a_stream_without_a_seam_and_is_common_to_no_two_m
     assert found_db == pytest.approx(louder.rain_db - raining.rain_db, abs=1.0)
 
 
-def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() -> None:
+def test_events_rise_to_line_of_sight_from_silence_to_silence() -> None:
     scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=42.0)
     alone = event_sound(
         event, site("SB1"), scene.settings.preset, scene.microphones, np.random.default_rng(2)
@@ -149,8 +147,8 @@ def test_the_level_rises_towards_line_of_sight_and_starts_and_ends_in_silence() 
 
 @pytest.mark.long
 @pytest.mark.parametrize("later_s", [1.5, 4.0])
-def test_what_a_second_vehicle_adds_is_the_difference_of_scenes_with_it_and_without(later_s: float) -> None:
-    """10 log10(1 + p2 / (p1 + background)) in the band, half a second each, of vehicles rendered apart."""
+def test_a_second_vehicle_adds_its_power(later_s: float) -> None:
+    """10 log10(1 + p2 / (p1 + background)) per half second of vehicles rendered separately."""
     scene = scene_of(16.0 / 60.0)
     events = [event_at(1.0), event_at(1.0 + later_s, "right")]
     (empty,), (first,), (both,) = (list(render_blocks(scene, some)) for some in ((), events[:1], events))
@@ -174,7 +172,7 @@ def test_what_a_second_vehicle_adds_is_the_difference_of_scenes_with_it_and_with
     np.testing.assert_allclose(added, 10.0 * np.log10(two / one), atol=0.5)
 
 
-def test_a_signal_is_heard_over_its_vehicle_and_leaves_it_as_it_is() -> None:
+def test_a_signal_is_added_to_the_unchanged_vehicle() -> None:
     scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=20.0)
     plain, warning = (
         event_sound(
@@ -189,7 +187,7 @@ def test_a_signal_is_heard_over_its_vehicle_and_leaves_it_as_it_is() -> None:
     assert (warning - plain).std() > 3 * plain.std()
 
 
-def test_no_seam_can_be_measured_where_pieces_of_background_meet() -> None:
+def test_pieces_of_background_join_without_a_seam() -> None:
     scene = scene_of(2.0, rate_hz=2000.0)
     sound = sound_of(scene, ())
     edges = [scene.piece * i for i in range(1, 4)]
@@ -210,7 +208,7 @@ def test_no_seam_can_be_measured_where_pieces_of_background_meet() -> None:
     assert near < 1.2 * jump.max() and near < 8.0 * jump.std() + jump.mean()
 
 
-def test_pieces_do_not_depend_on_which_were_rendered_before() -> None:
+def test_pieces_do_not_depend_on_the_order_of_rendering() -> None:
     scene = scene_of(1.0, rate_hz=2000.0)
     parts = pieces(scene, [event_at(3.0, "parks", 10.0), event_at(33.0, "parks", 10.0)])
     forth = [render_piece(scene, part).pressure_pa for part in parts]
@@ -223,10 +221,8 @@ def test_pieces_do_not_depend_on_which_were_rendered_before() -> None:
 @pytest.mark.parametrize("place", ["SB1", "TA101", "DB102"])
 @given(seed=st.integers(0, 10_000), microphones=st.lists(st.integers(1, 5), min_size=2, max_size=2))
 @settings(max_examples=2, deadline=None)
-def test_what_an_array_hears_does_not_depend_on_the_arrays_beside_it(
-    place: str, seed: int, microphones: list[int]
-) -> None:
-    """Microphones hear wind, drops and gusts by themselves, each array as if it were there alone."""
+def test_an_array_is_independent_of_other_arrays(place: str, seed: int, microphones: list[int]) -> None:
+    """Wind, drops and gusts of each array are those it has alone."""
     traffic = Traffic("all", {"left": 1200, "joins": 600}, sounds={"gusts": 1200, "rain": 600, "voice": 600})
     moment = StreamSettings(drawn_site(place), 0.08, seed, traffic, sample_rate_hz=2000.0)
     draw = np.random.default_rng(seed)
@@ -257,9 +253,7 @@ def test_memory_does_not_grow_with_the_length_of_a_stream() -> None:
     assert peak(3.0) < 1.05 * peak(1.5)
 
 
-def test_a_stream_on_disk_is_read_like_a_recording(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stream_on_disk_reads_as_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     positions = tmp_path / "pair.json"
     positions.write_text(json.dumps(PAIR.positions_m.tolist()))
     command = "sim make --minutes 0.25 --site SB1 --seed 33 --traffic busy --bandwidth 700 --json"
@@ -296,7 +290,7 @@ def test_a_stream_on_disk_is_read_like_a_recording(
     assert (taken.path, taken.name, taken.hazard_free) == (folder, "SB1-busy-33", True)
 
 
-def test_the_command_offers_every_traffic_and_refuses_what_a_stream_is_not(
+def test_the_stream_command_offers_all_traffic_and_reports_bad_options(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     refused = {
