@@ -1,4 +1,4 @@
-"""Moving white sources in a free field, rendered by acoular, and where they were when they were heard."""
+"""Moving white sources in a free field, rendered by Acoular, and their positions at emission."""
 
 from collections.abc import Callable
 
@@ -24,7 +24,7 @@ def direct(time_s: float) -> np.ndarray:
 
 
 def heard_at(path: Path, time_s: float) -> np.ndarray:
-    """Place where the source was when it emitted what arrives now."""
+    """Return the position of the source at the emission of the sound that arrives now."""
 
     def late(emitted_s: float) -> float:
         return emitted_s + float(np.linalg.norm(path(emitted_s))) / SPEED_OF_SOUND_M_S - time_s
@@ -33,7 +33,7 @@ def heard_at(path: Path, time_s: float) -> np.ndarray:
 
 
 def render(array: MicrophoneArray, path: Path, seconds: float, seed: int) -> np.ndarray:
-    """Sound at the microphones, shape (n, M)."""
+    """Return the sound at the microphones, shape (n, M)."""
     acoular.config.global_caching = "none"
     n = round(seconds * RATE)
     source = acoular.MovingPointSource(

@@ -13,7 +13,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 
 
 class Browser:
-    """A headless Chromium that is spoken to through a pipe: messages of JSON, each ended by a zero byte."""
+    """A headless Chromium controlled through a pipe of JSON messages that end with a zero byte."""
 
     def __init__(self, write: int, read: int) -> None:
         self.write, self.read, self.buffer, self.session = write, read, b"", {}
@@ -71,7 +71,7 @@ class Browser:
 
 @contextmanager
 def browser(folder: Path):
-    """Lend a browser whose descriptors 3 and 4 are ours."""
+    """Yield a browser with descriptors 3 and 4 of this process."""
     (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe"]
     shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'

@@ -1,4 +1,4 @@
-"""Hop tables that say nothing, to be filled in by a test."""
+"""Hop tables without information, to be filled in by a test."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 
 def blank_stream(name, hops):
-    """A hazard-free hop stream."""
+    """Return a hazard-free hop stream."""
     return HopTable(
         {
             "time_s": 1.0 + 0.1 * np.arange(hops),

@@ -1,4 +1,4 @@
-"""Sequence models and streams made up of random numbers."""
+"""Sequence models and streams of random numbers."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from worldstate.ground.typing import FloatArray
 
 
 def evidence_of(rng: np.random.Generator, hops: int) -> FloatArray:
-    """Return the columns of a stream that wanders, its looming refused now and then."""
+    """Return the columns of a random walk with occasionally unusable looming."""
     single = rng.normal(size=(7, hops)).cumsum(axis=1)
     refused = rng.random(hops) < 0.3
     single[4, refused] = 0.0
@@ -18,12 +18,12 @@ def evidence_of(rng: np.random.Generator, hops: int) -> FloatArray:
 
 
 def column(name: str) -> int:
-    """Return where the columns of a stream have what is named."""
+    """Return the index of a named column of streams."""
     return COLUMNS.index(name)
 
 
 def sequence_model(rng: np.random.Generator, alarm: SequenceAlarm | None = None) -> SequenceModel:
-    """Return a model of stumps, five for each input."""
+    """Return a model of five stumps per input."""
     trees = 5 * len(INPUTS)
     here = np.tile([0, 1, 2], (trees, 1))
     split, threshold = np.zeros((trees, 3), int), np.zeros((trees, 3))

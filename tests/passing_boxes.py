@@ -1,4 +1,4 @@
-"""Boxes of vehicles that come out from behind a corner, seen by a camera that is simulated by hand."""
+"""Boxes of vehicles that appear behind a corner in a simulated camera."""
 
 import math
 
@@ -13,7 +13,7 @@ LANE_M, EDGE_RAD, WIDTH_M, HEIGHT_M, LENGTH_M = 9.0, math.radians(28.0), 1.8, 1.
 
 
 def box_of(front_m: float, side: int) -> list[float] | None:
-    """A car whose front's middle is at y = side * front_m, on its way across; cut by the corner."""
+    """Return the box of a car with its front at y = side * front_m, cut by the corner."""
     limit = math.tan(EDGE_RAD)
     slopes = []
     for x in (LANE_M - 0.5 * WIDTH_M, LANE_M + 0.5 * WIDTH_M):
@@ -26,7 +26,7 @@ def box_of(front_m: float, side: int) -> list[float] | None:
 
 
 def passing(starts_s: list[tuple[float, int]], speed: float, rng: np.random.Generator) -> DetectionLog:
-    """Ten images a second of vehicles whose fronts are 20 m beside the axis at their start."""
+    """Return 10 images per second of vehicles that start 20 m beside the axis."""
     frames = []
     for image in range(round(10.0 * (max(start for start, _ in starts_s) + 12.0))):
         boxes = []

@@ -1,4 +1,4 @@
-"""Quantities that a snapshot publishes, and a snapshot in which one of them is held at its first value."""
+"""Quantities of a snapshot, and snapshots with one of them held at its first value."""
 
 import copy
 from dataclasses import fields, is_dataclass
@@ -7,7 +7,7 @@ from typing import Any, get_args, get_type_hints
 
 from worldstate import WorldState
 
-# Names of what a reader may assume; no filter sets another value.
+# Names that a reader may assume; no filter sets another value.
 CONSTANT = {"WorldState.frame_id", "WorldState.clock"}
 
 
@@ -26,13 +26,13 @@ def published(kind: Any = WorldState) -> dict[type, list[str]]:
 
 
 def quantities() -> list[str]:
-    """Return the names of all that a snapshot states."""
+    """Return the names of all quantities of a snapshot."""
     every = [f"{kind.__name__}.{name}" for kind, names in published().items() for name in names]
     return sorted(set(every) - CONSTANT)
 
 
 def held(value: Any, name: str, first: dict[str, Any]) -> Any:
-    """Return a value with the quantity of this name as it first was."""
+    """Return a value with the quantity of this name as in the first snapshot."""
     if isinstance(value, tuple):
         return tuple(held(one, name, first) for one in value)
     if not is_dataclass(value):
@@ -42,6 +42,6 @@ def held(value: Any, name: str, first: dict[str, Any]) -> Any:
         now = held(getattr(value, field.name), name, first)
         if f"{type(value).__name__}.{field.name}" == name:
             now = first.setdefault(name, now)
-        # No check of a constructor: what is held has to be noticed by what is published.
+        # Without the checks of the constructor: tests of published values must detect it.
         object.__setattr__(value, field.name, now)
     return value

@@ -1,4 +1,4 @@
-"""Where the released real feature windows are, for the tests that need them; they skip where nothing is."""
+"""The folder of the released real feature windows; tests without it are skipped."""
 
 import os
 from pathlib import Path
@@ -10,7 +10,7 @@ TABLE = "extracted_features.csv"
 
 
 def released_folder() -> Path | None:
-    """Return the folder that OVAD_FEATURES names, file or folder, or the one beside the repository."""
+    """Return the path of OVAD_FEATURES, or the folder beside the repository."""
     for place in filter(None, (os.environ.get("OVAD_FEATURES"), ROOT.parent / "shared" / "ovad")):
         folder = Path(place)
         folder = folder if folder.is_dir() else folder.parent

@@ -1,4 +1,4 @@
-"""Snapshots of a short scripted approach: heard and hidden on the left, then seen, then with a position."""
+"""Snapshots of a short scripted approach: hidden on the left, then visible, then with a position."""
 
 from dataclasses import replace
 
@@ -13,13 +13,13 @@ from worldstate.state import Classification
 from worldstate.state.sensor import Ego
 
 SILENT, FLAT = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
-# It stands in the map with its front to the left of the map's x axis.
+# In the map its front points to the left of the x axis.
 EGO = Ego((100.0, 50.0), 0.5 * np.pi, ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, 1e-4)), 0.0, 0.0, True)
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
 def scripted_states(hops: int = 5) -> list[WorldState]:
-    """Return one snapshot a hop with a vehicle heard on the left, and two of it in view."""
+    """Return one snapshot per hop with a hidden vehicle on the left, and two of it in view."""
     world, states = WorldFilter(), []
     for hop in range(1, hops + 1):
         sides = np.stack([_heard(0.9), _heard(0.01)])
@@ -33,7 +33,7 @@ def scripted_states(hops: int = 5) -> list[WorldState]:
 
 
 def _in_view(last: WorldState) -> list[WorldState]:
-    """Return what follows when it has come into view: by azimuth alone, then with a position."""
+    """Return the snapshots in view: by azimuth only, then with a position."""
     seen = replace(
         last.entities[0], status="visible", hidden_probability=0.0, existence_probability=0.98,
         azimuth_rad=0.5, azimuth_std_rad=0.03, sector_rad=None, sides=(),
@@ -46,7 +46,7 @@ def _in_view(last: WorldState) -> list[WorldState]:
 
 
 def _heard(coming: float) -> np.ndarray:
-    # Nothing of the rest comes: what does on both sides is one vehicle of unknown side.
+    # The other groups are empty; a vehicle on both sides is one of unknown side.
     groups = np.where([one.startswith("coming") for one in GROUPS], 0.0, 0.08 * (1.0 - coming))
     groups[GROUPS.index("coming_2s")], groups[GROUPS.index("seen")] = coming, 0.6 * (1.0 - coming)
     return groups

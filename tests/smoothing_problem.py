@@ -1,4 +1,4 @@
-"""The synthetic problem of smoothing: bearing and looming while hidden, then range, from a standing ego."""
+"""The synthetic smoothing problem: bearing and looming while hidden, then range, for a standing ego."""
 
 import math
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from worldstate.measurement import Approach, Bearing
 from worldstate.smoothing import AngularHeight, FixedLagSmoother, Range, SmoothingSettings
 
 HOP_S, HOP_NS, HOPS, HIDDEN_HOPS = 0.1, 100_000_000, 60, 35
-PSD = 1.0  # Of the vehicles' acceleration, m^2/s^3
+PSD = 1.0  # Of the acceleration of vehicles, m^2/s^3
 HIDDEN_STD_RAD, SEEN_STD_RAD, LOOMING_STD_HZ, RANGE_STD_M = math.radians(4.0), math.radians(1.0), 0.25, 0.5
 PRIOR = MotionBelief.around((0.9, -0.1, -0.2, math.log(25.0)), (0.35, 0.15, 0.15, 0.5))
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One vehicle, drawn from the prior where it comes neither too near nor too far, and what is measured."""
+    """One vehicle drawn from the prior at a suitable distance, and its measurements."""
 
     places_m: np.ndarray
     observations: list
@@ -58,7 +58,7 @@ def _drawn(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def hidden_errors_m(seed: int) -> tuple[float, float]:
-    """Return the rms error of the hidden positions of the filter and of the smoother."""
+    """Return the rms error of hidden positions of filter and smoother."""
     problem = heard_then_seen(np.random.default_rng(seed))
     belief, filtered = PRIOR, []
     smoother = FixedLagSmoother(SmoothingSettings(acceleration_psd=PSD))
@@ -84,12 +84,12 @@ PASS_HOPS, ENTITIES = 160, 3
 
 
 def slots_of_a_street(hops: int, rng: np.random.Generator) -> int:
-    """Return the factor slots after a stream of three entities."""
+    """Return the number of factor slots after a stream of three entities."""
     smoother = FixedLagSmoother()
     for hop in range(hops):
         seen = {}
         for number in range(ENTITIES):
-            # Each comes again when it has passed, under another name: 16 s, 24 m to 40 m away at first.
+            # Each returns after its pass with another name: 16 s, at first 24 m to 40 m away.
             after, passes = (hop + 53 * number) % PASS_HOPS, (hop + 53 * number) // PASS_HOPS
             seen[f"{number}-{passes}"] = crossing(after, number, rng)
         smoother.update(hop * HOP_NS, seen)
@@ -97,7 +97,7 @@ def slots_of_a_street(hops: int, rng: np.random.Generator) -> int:
 
 
 def crossing(hop: int, number: int, rng: np.random.Generator) -> list:
-    """Return what one entity is measured by at a hop of its pass."""
+    """Return the measurements of one entity at a hop of its pass."""
     side = 1 if number % 2 == 0 else -1
     x, y, speed = 8.0 + number, side * (24.0 - 0.3 * hop), 3.0
     azimuth, r = math.atan2(y, x), math.hypot(x, y)
@@ -108,7 +108,7 @@ def crossing(hop: int, number: int, rng: np.random.Generator) -> list:
     ]
     hidden = side * y / x > 0.6
     if hop % 10 == 0:
-        # Without any range, one entity in some 300 ends in gtsam's "indeterminate linear system".
+        # Without any range one entity in some 300 gives gtsam's "indeterminate linear system".
         heard.append(Range(max(r + rng.normal(0.0, 2.0), 1.0), 2.0))
     if not hidden:
         heard[0] = Bearing(azimuth + rng.normal(0.0, 0.01), 0.01)

@@ -1,4 +1,4 @@
-"""The laws of a snapshot, and of one that follows another, by what they publish alone."""
+"""Laws of a snapshot and of consecutive snapshots."""
 
 from collections.abc import Iterator
 
@@ -11,10 +11,10 @@ _BUDGET_LOST = {"uncalibrated", "unheard", "budget broken"}
 
 
 def broken_laws(state: WorldState, before: WorldState | None = None) -> list[str]:
-    """Return what a snapshot breaks; `before` is the one that was published last, of the same filter."""
-    state.to_json()  # Which refuses what is not finite
+    """Return the broken laws; `before` is the previous snapshot of the same filter."""
+    state.to_json()  # Which raises an error for values that are not finite
     told = [*_chances(state), *_advisories(state)]
-    # What comes late, or after a clock was set, changes the past that `before` tells of.
+    # Late measurements or a set clock change the past in `before`.
     if before is not None and _past(before) == _past(state) and before.stamp_ns <= state.stamp_ns:
         told += _in_time(state, before)
     return told
@@ -25,7 +25,7 @@ def _past(state: WorldState) -> tuple[int, int, int]:
 
 
 def _chances(state: WorldState) -> Iterator[str]:
-    """Yield what is no probability, or one that another one forbids."""
+    """Yield invalid or inconsistent probabilities."""
     stated = [one.existence_probability for one in state.entities]
     stated += [one.probability for one in state.relations]
     stated += [chance for cue in state.cues for chance in (cue.risk, *(cue.within or {}).values())]
@@ -48,7 +48,7 @@ def _chances(state: WorldState) -> Iterator[str]:
 
 
 def _advisories(state: WorldState) -> Iterator[str]:
-    """Yield where an advisory stands or is missing against what is published beside it."""
+    """Yield advisories that contradict the other fields."""
     for cue in state.cues:
         if cue.usable != (not cue.why_not):
             yield f"{cue.direction}: usable {cue.usable} beside {cue.why_not}"
@@ -61,7 +61,7 @@ def _advisories(state: WorldState) -> Iterator[str]:
             yield where + f"an advisory beside a risk of {cue.risk}"
         if (cue.held is not None) != (told is not None and not over):
             yield where + f"{terms}, held {cue.held}, advisory {told}"
-        # The rule names the likelier side only, and no alarm is raised within the first second.
+        # The rule applies to the likelier side only, and no alarm is raised within the first second.
         named = over and allowed and state.no_sequence != TOO_FEW
         if named and told is None and (terms.hypothesis != "hidden" or _nowhere(state)):
             yield where + f"no advisory above the threshold: {terms}, risk {cue.risk}"
@@ -76,15 +76,15 @@ def _advisories(state: WorldState) -> Iterator[str]:
 
 
 def _nowhere(state: WorldState) -> bool:
-    """Tell whether no side has an advisory, while the likeliest one may have one."""
+    """Whether no side has an advisory while the likeliest one may have one."""
     return all(cue.advisory is None and cue.risk >= LEAST_RISK for cue in state.cues)
 
 
 def _in_time(state: WorldState, before: WorldState) -> Iterator[str]:
-    """Yield what an advisory does that time and hand-overs do not allow."""
+    """Yield advisories that contradict time or hand-overs."""
     is_new = state.seq > before.seq
     gone = {one.entity_id for one in state.events if is_new and one.kind == "handed_over"}
-    # Carried further than what came next, it is no past of that.
+    # If `before` was predicted beyond this snapshot, it is not its past.
     if is_new and max(one.stamp_ns for one in state.sensors) < before.stamp_ns:
         return
     last = {cue.direction: cue for cue in before.cues}

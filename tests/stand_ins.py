@@ -1,4 +1,4 @@
-"""Stand-ins of a sound card, a camera and a detector, which give what a recording holds."""
+"""Stand-ins for sound card, camera and detector that play a recording."""
 
 import sys
 import threading
@@ -23,7 +23,7 @@ class Tensor:
 
 
 class Results:
-    """What ultralytics returns of an image: `names`, and tensors of `boxes`."""
+    """Results of ultralytics: `names` and tensors of `boxes`."""
 
     def __init__(self, frame, names):
         self.names = dict(enumerate(names))
@@ -33,7 +33,7 @@ class Results:
 
 
 class Street:
-    """One recording that is played `speed` times as fast to who opens sound card and camera."""
+    """One recording, played at `speed` by sound card and camera."""
 
     def __init__(self, recording, speed):
         self.samples, self.rate_hz = soundfile.read(recording / "out_multi.wav", dtype="float32")
@@ -48,7 +48,7 @@ class Street:
 
 
 class SoundCard(ModuleType):
-    """What is used of sounddevice."""
+    """Stand-in for sounddevice."""
 
     class PortAudioError(Exception):
         pass
@@ -82,7 +82,7 @@ class SoundCard(ModuleType):
 
 
 class Camera:
-    """What is used of OpenCV's VideoCapture: image k at 0.1 k seconds, its number in a pixel."""
+    """Stand-in for VideoCapture of OpenCV: image k at 0.1 k s, its number in a pixel."""
 
     def __init__(self, street):
         self.street, self.number = street, -1
@@ -103,7 +103,7 @@ class Camera:
 
 
 def stand_in(monkeypatch, recording, speed=2.0):
-    """Put a recording in the place of sound card, camera and detector."""
+    """Replace sound card, camera and detector by a recording."""
     street, yolo = Street(recording, speed), ModuleType("ultralytics")
 
     def model(weights):

@@ -1,4 +1,4 @@
-"""A rendered street for tests of what looks at frames: texture, a road, a car that drives through."""
+"""Rendered frames of a street with texture, a road and a passing car."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, zoom
@@ -9,7 +9,7 @@ WIDTH, HEIGHT = 640, 400
 
 
 def background(seed=0, level=110.0):
-    """Walls, windows and a road: edges at every scale, as in a street."""
+    """Return walls, windows and a road with edges at every scale."""
     rng = np.random.default_rng(seed)
     scene = np.full((HEIGHT, WIDTH), level)
     for size in (4, 10, 25, 60):
@@ -21,7 +21,7 @@ def background(seed=0, level=110.0):
 
 
 def car_box(frame, speed_px=12.0, start_px=-60.0):
-    """Left, top, right, bottom of the car in a frame, clipped; None where it is out of view."""
+    """Return left, top, right, bottom of the car in a frame, clipped, or None out of view."""
     left = start_px + speed_px * frame
     box = np.array([max(left, 0.0), 210.0, min(left + 130.0, WIDTH), 300.0])
     return None if box[2] - box[0] < 60.0 else box
@@ -43,7 +43,7 @@ def street(frames=60, seed=0, car=True, speed_px=12.0):
 
 
 def reference(frames=60, speed_px=12.0):
-    """The car's boxes as a detection log at 10 Hz."""
+    """Return the boxes of the car as a detection log at 10 Hz."""
     boxes = [car_box(number, speed_px) for number in range(frames)]
     rows = [np.empty((0, 4)) if box is None else box[None] for box in boxes]
     found = [DetectionFrame(row, np.ones(len(row)), ("car",) * len(row)) for row in rows]

@@ -1,4 +1,4 @@
-"""A street that a camera watches: false alarms, and a vehicle that is heard and comes into view."""
+"""A street with a camera: false alarms, and a vehicle that is audible before it is in view."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,11 +16,11 @@ from worldstate.measurement import Look
 SIDES, SILENT, HOP_NS, START_NS = ("left", "right"), NotUsable("not scripted"), 10**8, 3600 * 10**9
 NOTHING = SignatureEvidence(SIDES, (-1.0, -1.0), -1.0, 1.0)
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
-ALARM = SequenceAlarm(0.0, 4.0)  # Four onsets an hour
+ALARM = SequenceAlarm(0.0, 4.0)  # Four onsets per hour
 
 
 def heard(number: int, loud: str | None, answer: CoEvidence, level: float = 20.0) -> Measurement:
-    """Return a hop in which a vehicle comes from a side, so much likelier than none."""
+    """Return a hop with evidence `level` for a vehicle on a side."""
     groups = np.full((2, len(GROUPS)), 1e-3)
     groups[:, -1] = 1.0
     if loud is not None:
@@ -36,7 +36,7 @@ def heard(number: int, loud: str | None, answer: CoEvidence, level: float = 20.0
 def false_alarms(
     camera: str | None = "camera", mirrored: bool = False, hops: int = 500
 ) -> Iterator[Measurement]:
-    """Yield a false alarm of .4 s every four seconds, on either side in turn."""
+    """Yield a false alarm of 0.4 s every 4 s on alternating sides."""
     answer = Unqueried("no camera") if camera is None else Absent(0.04, 0.01)
     for number in range(1, hops):
         side = SIDES[(number // 40 + mirrored) % 2] if number % 40 < 4 else None
@@ -45,7 +45,7 @@ def false_alarms(
 
 
 def arrival(first: int, level: float = 20.0) -> Iterator[Measurement]:
-    """Yield a vehicle that is heard on the left for two seconds and drives into the view there."""
+    """Yield a vehicle that is audible on the left for 2 s and then in view."""
     for number in range(100):
         seen = 80 <= number < 92
         answer = (Present if seen else Absent)(0.04, 0.01)

@@ -7,13 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import softmax
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.road_users import (
-    DomainGuard,
-    Familiar,
-    Foreign,
-    WarningSignal,
-    neutral,
-)
+from worldstate.abduction.road_users import DomainGuard, Familiar, Foreign, WarningSignal, neutral
 from worldstate.ground.serialisation import decode, encode
 
 # Two measures: foreign sounds are at positive x, signals at (0, 5), street sounds at the origin.

@@ -12,11 +12,7 @@ from worldstate_lab.features.feature_evaluation import predict_held_out
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.file_io import refused_as_file
-from worldstate.adapters.files.model_file import (
-    Model,
-    read_model,
-    save_model,
-)
+from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.ground.errors import WorldstateError
 from worldstate.ground.serialisation import decode, encode
 from worldstate.operations.training.training import TrainingSettings, train_model

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.grounding.grounded_likelihood import (
-    LINE_SPACING,
-)
+from worldstate.abduction.grounding.grounded_likelihood import LINE_SPACING
 from worldstate.adapters.acoustic import AcousticAdapter, Grounding, observe
 from worldstate.adapters.listener import measure_steps, run
 from worldstate.adapters.source import ListenSettings, open_source

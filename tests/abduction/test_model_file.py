@@ -16,13 +16,7 @@ from worldstate.abduction.signature.published_signature import SignatureModel
 from worldstate.adapters.files import array_file
 from worldstate.adapters.files.array_file import named_arrays, read_array
 from worldstate.adapters.files.file_io import MAX_BYTES, refused_as_file
-from worldstate.adapters.files.model_file import (
-    KindShare,
-    Model,
-    RealFigure,
-    read_model,
-    save_model,
-)
+from worldstate.adapters.files.model_file import KindShare, Model, RealFigure, read_model, save_model
 from worldstate.belief.street_model import Number, StreetModel, StreetNumbers
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -277,8 +271,7 @@ def test_a_number_that_would_overflow_is_refused(path, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "{", "[]", "null", "NaN", '{"a": NaN}', "[" * 100_000, "\x00", '{"schema": 1}', "1" * 10_000],
+    "text", ["", "{", "[]", "null", "NaN", '{"a": NaN}', "[" * 100_000, "\x00", '{"schema": 1}', "1" * 10_000]
 )
 def test_a_text_that_is_no_model_is_refused(tmp_path, text):
     path = tmp_path / "no.json"

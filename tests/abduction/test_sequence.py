@@ -6,12 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sequence import column, evidence_of
 
-from worldstate.abduction.sequence.sequence_inputs import (
-    INPUTS,
-    MEMORY_HOPS,
-    RECENT_HOPS,
-    sequence_inputs,
-)
+from worldstate.abduction.sequence.sequence_inputs import INPUTS, MEMORY_HOPS, RECENT_HOPS, sequence_inputs
 from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
     HORIZONS_S,

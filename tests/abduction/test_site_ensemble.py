@@ -29,10 +29,7 @@ from worldstate.abduction.signature.window_classes import CLASSES, WINDOW_CLASSE
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
-from worldstate.operations.training.site_references import (
-    learned_while_listening,
-    with_site_references,
-)
+from worldstate.operations.training.site_references import learned_while_listening, with_site_references
 from worldstate.operations.training.training import fit_ensemble
 
 

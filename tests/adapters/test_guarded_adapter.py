@@ -106,8 +106,7 @@ def test_a_foreign_sound_is_not_taken_for_silence() -> None:
 def test_a_guard_of_other_measures_is_refused() -> None:
     one = guard()
     renamed = DomainGuard(
-        ("loudness", *MEASURES[1:]),
-        *(one.foreign, one.signals, one.weights, one.biases, one.threshold),
+        ("loudness", *MEASURES[1:]), *(one.foreign, one.signals, one.weights, one.biases, one.threshold)
     )
     with pytest.raises(OutOfDomainError, match="guard"):
         unwatched(Alarmed(), guard=renamed)

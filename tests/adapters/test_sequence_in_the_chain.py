@@ -255,9 +255,7 @@ def advised(folder: Path, model: Model, **asked: float) -> tuple[int, WorldState
     return sum(cue.advisory is not None for state in states for cue in state.cues), states[-1]
 
 
-def test_a_requested_budget_sets_threshold_and_promise(
-    folder: Path,
-) -> None:
+def test_a_requested_budget_sets_threshold_and_promise(folder: Path) -> None:
     model = curved(folder)
     few, quiet = advised(folder, model, budget=6.0)
     many, loud = advised(folder, model, budget=30.0)

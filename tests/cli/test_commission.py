@@ -1,4 +1,4 @@
-"""`worldstate model make` from an array file to a model that can be read, and its exam."""
+"""`worldstate model make` from an array file to a readable model and its exam."""
 
 import gzip
 import hashlib
@@ -18,7 +18,7 @@ ARRAY = "x,y,z\n0,0.2,0\n0,0.05,0\n0.05,-0.1,0\n0,-0.25,0\n"
 
 
 @pytest.mark.slow
-def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
+def test_commissioning_of_four_microphones_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mics.csv").write_text(ARRAY)
@@ -36,7 +36,7 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert "source 1        simulated streets: coefficients; licence: Apache-2.0" in card
     assert "simulated streets: exam" in card
     told = json.loads(report.read_text())
-    # Two renderings of the exam: the report, and the card that the model carries.
+    # Two renderings of the exam: the report and the card of the model.
     alone = sum(value for name, value in told.items() if name.startswith("approaches_"))
     assert sum(one.approaches for one in model.provenance.kinds) == alone
     assert model.provenance.exam["detected"] == told["detected"]
@@ -76,7 +76,7 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert main([*command[:2], *boards, "--out", str(tmp_path / "boards"), "--quick"]) == 0
     made = {path.name: path for path in (tmp_path / "boards").iterdir()}
     assert set(made) == {"respeaker-4.json.gz", "mics.json.gz"}
-    # The same model, but for the card of an exam that it did not sit.
+    # The same model except for the card of the omitted exam.
     save_model(out, replace(model, provenance=replace(model.provenance, exam={}, kinds=())))
     assert gzip.decompress(made["mics.json.gz"].read_bytes()) == out.read_bytes() != before
     other = read_model(made["respeaker-4.json.gz"])
@@ -89,13 +89,13 @@ def test_four_microphones_get_a_model_and_go_on_where_they_stopped(
     assert main([*command, "--no-exam", "--quiet", str(quiet), "--onsets", "600"]) == 0
     told = read_model(out).sequence
     assert told is not None and told.alarm is not None and told.alarm.onsets_per_hour == 600.0
-    # Of so little sound neither may reach any alarm: the hours are those that the curve was counted in.
+    # With so little sound no alarm may be reached: the hours are those of the curve.
     assert told.curve is not None and model.sequence.curve is not None
     assert told.curve.hours == pytest.approx(24.1 / 3600.0) != model.sequence.curve.hours
 
 
 @pytest.mark.slow
-def test_an_ego_that_drives_gets_a_sequence_of_its_own(tmp_path: Path) -> None:
+def test_a_moving_ego_has_a_sequence_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "mics.csv").write_text(ARRAY)
     out = tmp_path / "model.json"
     command = [
@@ -116,14 +116,14 @@ def test_an_ego_that_drives_gets_a_sequence_of_its_own(tmp_path: Path) -> None:
 
 
 def clips_of(folder: Path, road_user: str) -> list[str]:
-    """Write a clip and its table; return the options that learn from it."""
+    """Write a clip and its table; return the options for learning from it."""
     rng = np.random.default_rng(2)
     soundfile.write(folder / "clip.wav", 0.1 * rng.standard_normal(3 * 16_000), 16_000)
     (folder / "clips.csv").write_text(f"file,kind,recording,road_user\nclip.wav,pump,r,{road_user}\n")
     return ["--sounds", str(folder), "--kinds", str(folder / "clips.csv")]
 
 
-def test_what_cannot_be_learned_from_is_refused_before_anything_is_rendered(
+def test_wrong_training_data_raises_an_error_before_rendering(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["model", "make", "--quick", "--out", str(tmp_path / "model.json")]
@@ -141,7 +141,7 @@ def test_what_cannot_be_learned_from_is_refused_before_anything_is_rendered(
 
 
 @pytest.mark.slow
-def test_a_model_of_recorded_clips_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_model_card_lists_recorded_clips(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mics.csv").write_text(ARRAY)
     out, options = tmp_path / "model.json", clips_of(tmp_path, "")
     command = ["model", "make", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]

@@ -1,4 +1,4 @@
-"""`worldstate explain` on the snapshots of a short scripted approach, and where it refuses."""
+"""`worldstate explain` on the snapshots of a short scripted approach, and its errors."""
 
 import json
 import logging
@@ -24,7 +24,7 @@ SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
 def heard(coming: float) -> np.ndarray:
-    """Return a side on which somebody comes in two seconds with this probability, or is perhaps in view."""
+    """Return side probabilities with this share of a vehicle in two seconds."""
     groups = np.full(len(GROUPS), 0.4 * (1.0 - coming) / (len(GROUPS) - 2))
     groups[GROUPS.index("coming_2s")], groups[GROUPS.index("seen")] = coming, 0.6 * (1.0 - coming)
     return groups
@@ -32,7 +32,7 @@ def heard(coming: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def states(tmp_path_factory) -> Path:
-    """Half a second of nothing, half a second of somebody on the left, and speech that takes it away."""
+    """Write 0.5 s of an empty street, 0.5 s of a vehicle on the left and 0.5 s of speech."""
     path = tmp_path_factory.mktemp("explain") / "states.jsonl"
     world, lines = WorldFilter(), []
     for hop in range(1, 16):
@@ -56,7 +56,7 @@ def onset(states: Path) -> int:
     return next(hop for hop, state in enumerate(log, 1) if state.cues[0].advisory)
 
 
-def test_what_was_asked_of_the_alarm_stands_beside_what_its_curve_promises() -> None:
+def test_the_requested_budget_is_printed_beside_that_of_the_curve() -> None:
     world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02))
     promise = AlarmPromise(24.7, 9.1, 53.6, 0.0094, 0.0034, 0.0203)
     for alarm, words in (
@@ -78,7 +78,7 @@ def test_what_was_asked_of_the_alarm_stands_beside_what_its_curve_promises() -> 
         assert [cue.alpha for cue in state.cues] == [stated, stated]
 
 
-def test_a_reader_sees_at_a_glance_that_a_bicycle_would_not_be_heard() -> None:
+def test_low_recall_of_bicycles_is_printed() -> None:
     kinds = {"bicycle": 0.0, "car": 0.8}
     hop = Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, heard=Heard(0.5, "wind", kinds=kinds))
     lines = list(common_lines(WorldFilter().update(hop).state))
@@ -115,14 +115,14 @@ HELD = {
 
 
 def figures(state: WorldState) -> dict[str, float]:
-    """Return the log-odds of the left side, piece by piece."""
+    """Return the log-odds of the left side, term by term."""
     terms = state.cues[0].evidence
     together = {"together": sum(terms.terms_nats.values()), "compared": terms.compared_nats}
     return {**terms.terms_nats, **together, "time_s": state.stamp_ns / 1e9}
 
 
 @pytest.mark.parametrize(("hop", "said"), [(10, RAISED), (14, HELD)], ids=["raised", "held"])
-def test_it_prints_what_raised_and_what_holds_an_advisory(hop, said, states, capsys):
+def test_explain_prints_the_causes_of_an_advisory(hop, said, states, capsys):
     assert main(["explain", str(states), "--time", f"{hop / 10}", "--side", "left"]) == 0
     log = [WorldState.from_json(line) for line in states.read_text().splitlines()]
     cue = log[hop - 1].cues[0]
@@ -143,8 +143,8 @@ def test_it_prints_what_raised_and_what_holds_an_advisory(hop, said, states, cap
     )
 
 
-def test_without_a_time_all_are_listed_and_the_first_is_explained(states, onset, capsys):
-    assert 7 <= onset <= 10  # While it is heard, and not in the first hop
+def test_without_a_time_all_advisories_are_listed(states, onset, capsys):
+    assert 7 <= onset <= 10  # During the approach, and not in the first hop
     assert main(["explain", str(states)]) == 0
     listed, explained = capsys.readouterr().out.split("\n\n")
     assert listed.splitlines() == [
@@ -159,7 +159,7 @@ def test_without_a_time_all_are_listed_and_the_first_is_explained(states, onset,
     assert told["time_s"] == riskiest["stamp_ns"] / 1e9
 
 
-def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, onset, capsys):
+def test_explain_prints_why_there_is_no_advisory(states, onset, capsys):
     assert main(["explain", str(states), "--time", f"{onset / 10 - 0.12:.2f}", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["time_s"] == pytest.approx(onset / 10 - 0.1)
@@ -168,7 +168,7 @@ def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, onset,
         "right": "below",
     }
     terms = told["sides"]["left"]["cue"]["evidence"]["terms_nats"]
-    assert terms["prior"] == pytest.approx(np.log(0.4 / 0.6))  # Six of fifteen groups come within 3 s
+    assert terms["prior"] == pytest.approx(np.log(0.4 / 0.6))  # Six of fifteen groups are within 3 s
     assert terms["sequence"] > 1.0 > 0.0 > told["sides"]["right"]["cue"]["evidence"]["compared_nats"]
 
 
@@ -181,12 +181,12 @@ def test_it_says_why_there_is_none_and_takes_the_nearest_snapshot(states, onset,
         ("--time nan", "--time"),
     ],
 )
-def test_a_time_outside_and_a_side_that_is_none_are_named(words, said, states, capsys):
+def test_wrong_times_and_sides_raise_an_error(words, said, states, capsys):
     assert main(["explain", str(states), *words.split()]) == 2
     assert said in capsys.readouterr().err
 
 
-def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, tmp_path, capsys):
+def test_other_versions_and_empty_logs_raise_an_error(states, tmp_path, capsys):
     file = tmp_path / "old.jsonl"
     file.write_text(states.read_text().replace('"version":"4.2.0"', '"version":"2.1.0"'))
     assert main(["explain", str(file), "--time", "1"]) == 2
@@ -197,8 +197,8 @@ def test_files_of_another_version_and_without_snapshots_say_what_to_do(states, t
     assert "worldstate run --out" in capsys.readouterr().err
 
 
-def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, onset, tmp_path, capsys):
-    """What was rotated, or cut at a line or within one, at its beginning or its end."""
+def test_partial_logs_are_explained_and_replayed(states, onset, tmp_path, capsys):
+    """The log is rotated or cut at or within a line at its beginning or end."""
     whole, log = states.read_bytes(), tmp_path / "rotated.jsonl"
     lines = whole.splitlines(keepends=True)
     for first in range(14):
@@ -216,7 +216,7 @@ def test_a_log_that_begins_anywhere_is_explained_and_replayed(states, onset, tmp
             assert replayed["states"] == 15 - first and replayed["advisory_onsets_s"] == [onset / 10]
 
 
-# What a crash, an editor or a disk leaves between the lines, and how many lines it costs.
+# Damage between lines by a crash, an editor or a disk, and the number of lost lines.
 DAMAGE = {
     "a byte order mark": (lambda lines: [b"\xef\xbb\xbf" + lines[0], *lines[1:]], 0),
     "blank lines": (lambda lines: [b"\n", *lines[:3], b"\r\n", *lines[3:]], 0),
@@ -230,7 +230,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_damage_costs_the_lines_that_have_it_and_is_told_once(name, states, tmp_path, capfd, monkeypatch):
+def test_damaged_lines_are_skipped_with_one_notice(name, states, tmp_path, capfd, monkeypatch):
     change, cost = DAMAGE[name]
     lines = states.read_bytes().splitlines(keepends=True)
     log = tmp_path / "damaged.jsonl"
@@ -248,7 +248,7 @@ def test_damage_costs_the_lines_that_have_it_and_is_told_once(name, states, tmp_
     assert len(again) == len(lines) - cost and set(again) <= set(lines)
 
 
-def test_a_log_in_mcap_is_explained_alike(states, tmp_path, capsys):
+def test_an_mcap_log_gives_the_same_explanation(states, tmp_path, capsys):
     assert main(["log", "replay", str(states), "--export", f"mcap={tmp_path / 'a.mcap'}"]) == 0
     told = []
     (tmp_path / "a.mcap.1").write_bytes((tmp_path / "a.mcap").read_bytes())

@@ -1,4 +1,4 @@
-"""Faults of files, disks and users: one line and exit code 2, nothing destroyed, nothing left behind."""
+"""Faults of files, disks and users: one line, exit code 2 and no files lost or left."""
 
 import json
 import os
@@ -32,7 +32,7 @@ RECORDING = "set/SA1/left/1_00_0000"
 
 
 def tree(root: Path) -> dict[str, object]:
-    """Return every name below `root` with what it holds."""
+    """Return every name below `root` with its content."""
     return {str(path.relative_to(root)): content(path) for path in sorted(root.rglob("*"))}
 
 
@@ -43,7 +43,7 @@ def content(path: Path) -> object:
 
 
 def refusal(words: list[str], root: Path, capsys) -> str:
-    """Run a command that shall be refused, and return the one line that it says."""
+    """Run a command that must fail with one line and no change of files, and return the line."""
     before = tree(root)
     assert main(words) == 2
     captured = capsys.readouterr()
@@ -57,7 +57,7 @@ def refusal(words: list[str], root: Path, capsys) -> str:
 
 @pytest.fixture
 def files(tmp_path, monkeypatch) -> Path:
-    """Inputs that no reader could read: whatever is refused is refused before the work."""
+    """Write inputs that no command can read, so errors come before any reading."""
     monkeypatch.chdir(tmp_path)
     for name in ("a.wav", "m.json", "t.csv", "ids.csv", "mics.xml", "v.mp4", f"{RECORDING}/out_multi.wav"):
         Path(name).parent.mkdir(parents=True, exist_ok=True)
@@ -103,7 +103,7 @@ def files(tmp_path, monkeypatch) -> Path:
         ("sim make --out a.wav", "a.wav"),
     ],
 )
-def test_an_output_that_cannot_be_is_refused_before_the_work(line, named, files, capsys):
+def test_bad_outputs_raise_an_error_before_the_work(line, named, files, capsys):
     assert named in refusal(line.split(), files, capsys)
 
 
@@ -140,12 +140,12 @@ def test_an_output_that_cannot_be_is_refused_before_the_work(line, named, files,
         ("log replay m.json --export osi=m.json --export osi=b", "m.json: expected another file"),
     ],
 )
-def test_an_option_that_would_do_nothing_is_refused_before_the_work(line, said, files, capsys):
+def test_options_without_effect_raise_an_error_before_the_work(line, said, files, capsys):
     assert said in refusal(line.split(), files, capsys)
 
 
-def test_the_boxes_of_one_recording_are_not_those_of_several(tmp_path, capsys):
-    """A car's camera may name what it detected, which is of one recording as --detections is."""
+def test_boxes_need_one_recording(tmp_path, capsys):
+    """A camera of a car file may name detections, which belong to one recording."""
     camera = {"name": "front", "width_px": 640, "height_px": 480, "horizontal_fov_deg": 90}
     camera |= {"position_m": [0, 0, 0], "detections": "boxes.json"}
     (tmp_path / "car.json").write_text(json.dumps({"cameras": [camera]}))
@@ -158,7 +158,7 @@ def test_the_boxes_of_one_recording_are_not_those_of_several(tmp_path, capsys):
             assert "expected one recording with --detections or --car" in refusal(words, tmp_path, capsys)
 
 
-def test_reference_boxes_of_one_video_are_not_those_of_several(tmp_path, capsys):
+def test_reference_boxes_need_one_video(tmp_path, capsys):
     rows = [LogRow(f"1_00_000{number}", "SA1", "left", 5) for number in (0, 1)]
     for row in rows:
         (tmp_path / row.folder).mkdir(parents=True)
@@ -177,14 +177,14 @@ def test_reference_boxes_of_one_video_are_not_those_of_several(tmp_path, capsys)
         ("sim make --out new --static 1 --video", "cv2"),
     ],
 )
-def test_a_package_that_is_missing_is_named_before_the_work(line, extra, files, capsys, monkeypatch):
+def test_missing_packages_are_named_before_the_work(line, extra, files, capsys, monkeypatch):
     real = extras.find_spec
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name == extra else real(name))
     assert "pip install" in refusal(line.split(), files, capsys)
 
 
 @pytest.mark.parametrize("file", ["timeline.png", "states.jsonl"])
-def test_a_folder_in_the_place_of_a_figure_is_seen_before_the_work(file, tmp_path, capsys):
+def test_a_folder_named_as_a_figure_raises_an_error_before_the_work(file, tmp_path, capsys):
     (tmp_path / file).mkdir()
     assert file in refusal(["demo", "--out", str(tmp_path)], tmp_path, capsys)
 
@@ -210,7 +210,7 @@ def test_an_output_keeps_the_permissions_of_the_file_it_replaces(tmp_path):
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
-def test_no_permission_is_said_before_the_work(files, capsys):
+def test_missing_permission_is_reported_before_the_work(files, capsys):
     Path("folder").chmod(0o500)
     assert "permission" in refusal(["run", "a.wav", "--out", "folder/s.jsonl"], files, capsys)
     Path("m.json").chmod(0o400)
@@ -222,7 +222,7 @@ def test_no_permission_is_said_before_the_work(files, capsys):
 
 @pytest.mark.parametrize("suffix", [".raw", ".au", ".ogg", ".mp3", ".wav", ".npz", ""])
 @pytest.mark.parametrize("command", ["run", "array check", "model threshold"])
-def test_bytes_that_are_no_sound_are_one_line(command, suffix, tmp_path, capsys):
+def test_bytes_that_are_no_sound_give_one_line(command, suffix, tmp_path, capsys):
     sound = tmp_path / f"f{suffix}"
     sound.write_bytes(np.random.default_rng(1).bytes(5000))
     out = ["--out", str(tmp_path / "m.json")] if command == "model threshold" else []
@@ -231,7 +231,7 @@ def test_bytes_that_are_no_sound_are_one_line(command, suffix, tmp_path, capsys)
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
-    """Small inputs of every kind, each of which its command reads."""
+    """Write small inputs of every kind, each readable by its command."""
     folder = tmp_path_factory.mktemp("whole")
     write_inputs(folder)
     return folder
@@ -255,7 +255,7 @@ READERS = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", READERS)
-def test_a_damaged_file_is_read_or_refused_in_one_line(name, whole, tmp_path, capsys):
+def test_damaged_files_are_read_or_give_one_line(name, whole, tmp_path, capsys):
     rng = np.random.default_rng(len(name))
     data, file, new = (whole / name).read_bytes(), tmp_path / name, tmp_path / "new"
     refused = 0
@@ -266,7 +266,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name, whole, tmp_path, ca
         code = main(line.split())
         said = capsys.readouterr().err.strip().splitlines()
         assert code in (0, 1, 2)
-        # Before the refusal a command may have said what it takes the array to be.
+        # The command may print the assumed array before the error.
         assert code != 2 or (said[-1].startswith("worldstate: ") and not new.exists()), said
         assert file.read_bytes() == spoilt
         assert {path.name for path in tmp_path.iterdir()} <= {name, "new"}
@@ -279,7 +279,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name, whole, tmp_path, ca
 
 
 def on_small_disk(words: list[str], limit: int = 4096) -> subprocess.CompletedProcess[str]:
-    """Run a command that may write so many bytes a file."""
+    """Run a command that may write `limit` bytes per file."""
     return subprocess.run(
         [*COMMAND, *words],
         capture_output=True,
@@ -313,8 +313,8 @@ def test_a_full_disk_leaves_no_figure(tmp_path):
     assert tree(tmp_path) == before
 
 
-def test_a_full_standard_output_is_one_line():
-    for unbuffered in ("", "1"):  # In a buffer it is written last by the interpreter itself
+def test_a_full_standard_output_gives_one_line():
+    for unbuffered in ("", "1"):  # The interpreter itself writes the buffer last.
         with Path("/dev/full").open("w") as full:
             done = subprocess.run(
                 [*COMMAND, "array", "bounds"],
@@ -327,7 +327,7 @@ def test_a_full_standard_output_is_one_line():
         assert "No space left" in one_line(done)
 
 
-def test_a_reader_that_has_seen_enough_is_no_error():
+def test_a_closed_pipe_is_no_error():
     line = " ".join([*COMMAND, "array", "bounds", "--json"])
     done = subprocess.run(
         ["bash", "-c", f"{line} | true; exit ${{PIPESTATUS[0]}}"], capture_output=True, check=False
@@ -340,7 +340,7 @@ def test_a_reader_that_has_seen_enough_is_no_error():
 
 def interrupted(words: list[str], begun, number: int) -> int:
     """Start a command, signal it (all its processes, as a terminal does on Ctrl-C) once `begun`."""
-    # What a shell ignores in the background (`nohup`) is inherited: a terminal's Ctrl-C is not.
+    # A signal that a shell ignores in the background (`nohup`) is inherited; Ctrl-C of a terminal is not.
     running = subprocess.Popen(
         [*COMMAND, *words],
         stderr=subprocess.PIPE,
@@ -358,7 +358,7 @@ def interrupted(words: list[str], begun, number: int) -> int:
     try:
         _, said = running.communicate(timeout=60.0)
     finally:
-        # Of a command that goes on regardless nothing may stay behind: it would slow down all other tests.
+        # Kill a command that continues, because it would slow down all other tests.
         if running.poll() is None:
             os.killpg(running.pid, signal.SIGKILL)
     assert "Traceback" not in said
@@ -387,7 +387,7 @@ def test_a_signal_waits_for_files_that_belong_together(number, code):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("number", "code"), CODES)
-def test_an_interrupted_simulation_lists_what_it_leaves(number, code, tmp_path):
+def test_an_interrupted_simulation_lists_its_recordings(number, code, tmp_path):
     words = ["sim", "make", "--out", str(tmp_path), "--static", "400", "--duration", "0.5", "--jobs", "2"]
     words += ["--bandwidth", "2000"]
     assert interrupted(words, (tmp_path / "DataLog.csv").exists, number) == code
@@ -407,7 +407,7 @@ def test_an_interrupted_run_leaves_nothing(number, code, tmp_path):
     assert list(tmp_path.iterdir()) == [sound]
 
 
-def test_another_simulation_keeps_what_the_log_lists(tmp_path):
+def test_a_second_simulation_keeps_the_recordings_of_the_log(tmp_path):
     write_log(tmp_path, [LogRow("3_01_0007", "SA2", "right", 70)])
     (tmp_path / "SA2/right/3_01_0007").mkdir(parents=True)
     words = ["sim", "make", "--out", str(tmp_path), "--duration", "0.5", "--static", "1"]
@@ -463,7 +463,7 @@ CAR = "run real.wav --car car.json"
         (CAR, {"array": {"file": "mics.csv"}, "odometry": "o\0.csv"}),
     ],
 )
-def test_a_pipe_a_device_and_a_nul_are_refused_at_once(line, car, street, files, capsys):
+def test_pipes_devices_and_nul_names_raise_an_error_at_once(line, car, street, files, capsys):
     shutil.copy(street / "street.wav", "real.wav")
     shutil.copy(street / "mics.csv", "mics.csv")
     os.mkfifo("bag.mcap")
@@ -488,7 +488,7 @@ PORTS = "9" * 5, "9" * 4000, "9" * 5000, "-1", "x"
 
 
 @pytest.mark.parametrize("option", ["--detections", "--odometry", "--export=odas", "--allow"])
-def test_an_address_that_is_none_is_refused(option, street, files, capsys):
+def test_wrong_addresses_raise_an_error(option, street, files, capsys):
     shutil.copy(street / "street.wav", "real.wav")
     shutil.copy(street / "mics.csv", "mics.csv")
     named = [*((host, "9000") for host in HOSTS), *(("127.0.0.1", port) for port in PORTS)]
@@ -542,7 +542,7 @@ def test_no_control_character_reaches_a_terminal(words, files, capsys):
     assert [one for one in printed if not (one.isprintable() or one == "\n")] == []
 
 
-def test_what_is_logged_is_written_for_a_terminal():
+def test_log_messages_are_escaped_for_a_terminal():
     script = (
         "import logging; from worldstate.cli.main import main; main(['--version'])\n"
         "logging.getLogger('worldstate').warning('%s', chr(27) + '[2J')"

@@ -1,4 +1,4 @@
-"""A run that goes on where another ended, and the bearing in the snapshot."""
+"""A run that continues another one, and the bearing in the snapshot."""
 
 import json
 
@@ -11,10 +11,10 @@ from worldstate.cli.main import main
 
 @pytest.mark.long
 @pytest.mark.parametrize("follows", [False, True])
-def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path):
+def test_a_resumed_run_equals_a_whole_one(approach, follows, tmp_path):
     sound, rate = soundfile.read(approach.audio_path, dtype="float32")
     sound, half = sound[: 8 * rate], 4 * rate
-    # What follows overlaps by the second that fills the windows.
+    # The second part overlaps by the second that fills the windows.
     first = half - rate if follows else 0
     for name, part in (("whole", sound), ("half", sound[:half]), ("rest", sound[first:])):
         soundfile.write(tmp_path / f"{name}.wav", part, rate, subtype="FLOAT")
@@ -40,9 +40,9 @@ def test_half_a_recording_and_the_rest_are_the_whole(approach, follows, tmp_path
     expected = np.array([told(s) for s in whole])
     stamps, values = np.split(np.array([told(s) for s in before + after]) - expected, [1], axis=1)
     assert np.abs(stamps).max() == 0.0
-    # Frames of the transform lie elsewhere in a file that begins elsewhere: of two directions that are nearly
-    # as loud, now one and now the other is the louder, and trees take a small difference as a step; inputs of
-    # eight seconds keep it for as long (.89 of the values within .1).
+    # Frames of the transform differ if the file begins elsewhere. Of two nearly equal directions either may
+    # be the louder, and trees turn a small difference into a step, which inputs of eight seconds keep for as
+    # long (0.89 of the values within 0.1).
     assert (np.abs(values) < (0.1 if follows else 1e-9)).mean() > (0.85 if follows else 1.0 - 1e-9)
     stated = [s["bearing"] for s in whole if s["bearing"]]
     assert len(stated) > len(whole) / 2

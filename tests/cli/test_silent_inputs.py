@@ -1,4 +1,4 @@
-"""An input of `run` that is well formed and contributes nothing draws a line, or is refused."""
+"""A well-formed input of `run` without effect gives a line or an error."""
 
 import json
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ def stamped(first_s: float, unit: float = 1e9) -> object:
     }
 
 
-# What is given beside the sound: an option and its file's content, or its words; and what is said of it.
+# Inputs beside the sound: an option with the content of its file or its words, and the printed line.
 SILENT: dict[str, tuple[Mapping[str, object], str]] = {
     "boxes of no image": ({"--detections d.json": NOTHING}, "searched no image"),
     "results of no box": ({"--detections d.json": []}, "searched no image"),
@@ -70,10 +70,7 @@ SILENT: dict[str, tuple[Mapping[str, object], str]] = {
         "on the clock of the sound",
     ),
     "odometry of the last hop": ({"--odometry o.csv": odometry(2.99)}, "1 of 1 stamps lie within the sound"),
-    "odometry in milliseconds": (
-        {"--odometry o.csv": odometry(*range(0, 3000, 100))},
-        "in another unit",
-    ),
+    "odometry in milliseconds": ({"--odometry o.csv": odometry(*range(0, 3000, 100))}, "in another unit"),
     "a topic without a bag": ({"--topic": "detections=/boxes"}, "topics: expected a bag"),
     "sound that was heard before": ({"--resume state.json": None}, "all of this sound was used before"),
 }
@@ -92,7 +89,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", SILENT)
-def test_what_contributes_nothing_draws_a_line(
+def test_an_input_without_effect_gives_a_line(
     street: Path,
     name: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -125,7 +122,7 @@ def test_what_contributes_nothing_draws_a_line(
         "--resume state.json --start 3",
     ],
 )
-def test_what_contributes_is_not_remarked_on(
+def test_an_input_with_an_effect_gives_no_line(
     street: Path,
     words: str,
     monkeypatch: pytest.MonkeyPatch,

@@ -1,4 +1,4 @@
-"""Labelled windows that a commissioned model learns are of its array, and the model says so."""
+"""Labelled windows in commissioning: their array and its record in the model."""
 
 from dataclasses import replace
 
@@ -17,14 +17,14 @@ ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.1, -0.3, 0.0]], "t
 HERE = domain_of(ARRAY, [6000.0], ["SA101"])
 
 
-def test_a_table_that_names_no_array_is_of_this_one_and_one_of_another_is_refused() -> None:
+def test_tables_of_another_array_raise_an_error() -> None:
     names = np.array(["SA1", "SB1", "SB2"])
     table = FeatureTable(
         np.ones((3, 60)), np.array(["left", "none", "front"]), names, names, names, (None,) * 3
     )
     kept = windows_of_array(table, CommissionSettings(leave_out=("SB1",)), HERE)
     assert kept.environments.tolist() == ["SA1", "SB2"]
-    # Without it a commissioned model would state no budget and no times.
+    # Without it a commissioned model would have no budget and no times.
     assert kept.domain is HERE
     elsewhere = domain_of(MicrophoneArray(ARRAY.positions_m * [1.0, 1.1, 1.0]), [6000.0], ["SA1"])
     with pytest.raises(OutOfDomainError, match="not the array"):
@@ -35,7 +35,7 @@ class LearnedError(Exception):
     pass
 
 
-def test_real_windows_alone_are_fitted_once_for_all_folds_of_a_moving_ego(tmp_path, monkeypatch) -> None:
+def test_real_windows_are_fitted_once_for_all_folds(tmp_path, monkeypatch) -> None:
     names, fitted = np.array(["DA1", "DB1", "DB2"]), []
     table = FeatureTable(
         np.ones((3, 60)), np.array(["left", "none", "front"]), names, names, names, (None,) * 3

@@ -1,4 +1,4 @@
-"""Training a guard on rows whose clusters are known, and on sounds of the simulator."""
+"""Training of a guard on known clusters and simulated sounds."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ SITES, EACH = ("one", "two", "three"), 60
 
 
 def made_up_rows(seed: int, apart: float = 10.0) -> SoundRows:
-    """Draw clusters: streets at the origin, each kind of sound on an axis of its own."""
+    """Draw clusters: streets at the origin, each kind of sound on its own axis."""
     rng = np.random.default_rng(seed)
     kinds = [kind for kind in (*STREET, *FOREIGN, *SIGNALS) for _ in range(EACH)] * len(SITES)
     sites = np.repeat(SITES, len(kinds) // len(SITES))
@@ -40,14 +40,14 @@ def made_up_rows(seed: int, apart: float = 10.0) -> SoundRows:
     return SoundRows(middle + rng.standard_normal(middle.shape), np.array(kinds), sites)
 
 
-def test_streets_never_heard_are_flagged_as_often_as_stated_and_sounds_are_found() -> None:
+def test_new_streets_have_the_stated_false_rate() -> None:
     rows, fresh = made_up_rows(1), made_up_rows(2)
     guard = fit_guard(rows, threshold_of(list(street_excesses(rows).values())))
     street = np.isin(fresh.kinds, STREET)
     share = float((guard.log_odds(fresh.measures[street]) > 0.0).mean())
-    # 540 hops: three standard deviations of a share of .025.
+    # 540 hops: three standard deviations of a share of 0.025.
     assert share < FLAGGED + 3.0 * np.sqrt(FLAGGED / street.sum())
-    # At even odds: a guard as it is trained calls many sounds signals, so that few signals are missed.
+    # At even odds, because a trained guard calls many sounds signals in order to miss few.
     guard = replace(guard, signal_nats=0.0)
     for kind, expected in (("voice", Foreign), ("rain", Foreign), ("wail", WarningSignal)):
         verdicts = [guard.judge(one) for one in fresh.measures[fresh.kinds == kind]]
@@ -55,8 +55,8 @@ def test_streets_never_heard_are_flagged_as_often_as_stated_and_sounds_are_found
     assert len(str(encode(guard))) < 60_000
 
 
-def test_a_street_with_other_sounds_sets_no_threshold() -> None:
-    """Its hops are learned as what streets hold, but music that is called foreign is no false call."""
+def test_streets_with_other_sounds_set_no_threshold() -> None:
+    """Its hops are learned as street, but music called foreign is no false call."""
     pair = MicrophoneArray([[0.0, 0.3, 1.7], [0.0, -0.3, 1.7]])
     for name in ("empty", "music"):
         settings = StreamSettings(junction_named("SA101"), 0.2, 1, traffic_named(name), sample_rate_hz=6000.0)
@@ -66,8 +66,8 @@ def test_a_street_with_other_sounds_sets_no_threshold() -> None:
 
 
 @pytest.mark.long
-def test_motorcycles_are_the_street_to_the_guard_that_ships_and_machines_are_not() -> None:
-    """Clips of seeds that no guard learned, passing and standing, as other recorders hear them."""
+def test_the_shipped_guard_accepts_motorcycles_and_not_machines() -> None:
+    """Clips of new seeds, passing and standing, of other recorders."""
     guard = read_model(None).guard
     assert guard is not None
     familiar = {}
@@ -80,8 +80,8 @@ def test_motorcycles_are_the_street_to_the_guard_that_ships_and_machines_are_not
 
 
 @pytest.mark.slow
-def test_an_exam_leaves_out_what_it_asks_for() -> None:
-    # On orthogonal axes nothing learned of one kind tells another: a guard that had heard it would.
+def test_an_exam_excludes_its_own_sounds() -> None:
+    # On orthogonal axes one learned kind gives no information about another.
     found = {(one.without, one.kind): one for one in guard_exam(made_up_rows(3))}
     known, unknown = found["nothing", "voice"], found["voice", "voice"]
     assert known.foreign > 0.85
@@ -101,7 +101,7 @@ def test_an_exam_leaves_out_what_it_asks_for() -> None:
 
 
 @pytest.mark.slow
-def test_sounds_of_the_simulator_are_heard_above_the_ambience() -> None:
+def test_simulated_sounds_exceed_the_ambience() -> None:
     rows = sound_rows(ovad_array(), "SB1", 6000.0, np.random.default_rng(1))
     assert set(rows.kinds.tolist()) <= {*FOREIGN, *SIGNALS}
     assert {"voice", "music", "siren"} <= set(rows.kinds.tolist())

@@ -1,4 +1,4 @@
-"""What a wrong mounting does: places believed that are not true, bearings beside what is in view."""
+"""Effects of a wrong mounting on positions and bearings."""
 
 import dataclasses
 
@@ -25,20 +25,20 @@ ARRAY = MicrophoneArray([[0.1, 0.2, 0.0], [0.0, 0.05, 0.1], [0.0, -0.1, 0.0], [-
 
 
 @given(st.floats(-np.pi, np.pi))
-def test_a_plane_wave_is_heard_two_degrees_aside_by_who_believes_a_turned_array(azimuth_rad: float) -> None:
+def test_a_turned_array_turns_the_bearing(azimuth_rad: float) -> None:
     _, turned, _ = mountings(ARRAY, np.random.default_rng(1)).values()
     np.testing.assert_allclose(
         turned.delays_s(azimuth_rad + np.radians(2.0)), ARRAY.delays_s(azimuth_rad), atol=1e-12
     )
 
 
-def test_positions_are_off_by_five_millimetres_in_every_direction() -> None:
+def test_position_errors_are_five_millimetres_in_every_direction() -> None:
     many = MicrophoneArray(np.random.default_rng(1).uniform(-1.0, 1.0, (600, 3)))
     *_, off = mountings(many, np.random.default_rng(2)).values()
     np.testing.assert_allclose((off.positions_m - many.positions_m).std(axis=0), 5e-3, rtol=0.12)
 
 
-def test_one_rendering_is_heard_by_every_array_as_it_would_be_alone() -> None:
+def test_one_rendering_serves_all_arrays() -> None:
     settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
     mounted = list(mountings(ARRAY, np.random.default_rng(1)).values())
     right, turned, _ = hear_stream(settings, [ARRAY], [mounted])
@@ -48,8 +48,8 @@ def test_one_rendering_is_heard_by_every_array_as_it_would_be_alone() -> None:
     assert not np.array_equal(turned.hops.feature, right.hops.feature)
 
 
-def test_what_is_rendered_for_one_array_is_kept_for_those_beside_it(tmp_path, monkeypatch) -> None:
-    """A second array of one call waits for no street to be rendered again, and hears what it would alone."""
+def test_renderings_are_reused_for_other_arrays(tmp_path, monkeypatch) -> None:
+    """A second array needs no new rendering and has the sound it has alone."""
     settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
     board = MicrophoneArray(ARRAY.positions_m[:3] * [1.0, 0.5, 1.0])
     (expected,) = hear_stream(settings, [board])
@@ -60,8 +60,8 @@ def test_what_is_rendered_for_one_array_is_kept_for_those_beside_it(tmp_path, mo
     np.testing.assert_array_equal(kept.hops.time_s, expected.hops.time_s)
 
 
-def test_wrong_mountings_are_heard_in_as_many_processes_as_asked(tmp_path, monkeypatch) -> None:
-    """Half an hour of streams an ear: with one process the command takes as long as its whole exam."""
+def test_wrong_mountings_use_the_requested_processes(tmp_path, monkeypatch) -> None:
+    """One process for half an hour of streams per array would take as long as the exam."""
     asked, heard = [], [passing(0.0), passing(2.0), passing(1.0)]
     monkeypatch.setattr(commission, "examine_stream", lambda model, one: one)
     monkeypatch.setattr(
@@ -75,7 +75,7 @@ def test_wrong_mountings_are_heard_in_as_many_processes_as_asked(tmp_path, monke
 
 
 def passing(bearing_deg: float) -> HeardStream:
-    """Return a stream with one vehicle at 45 degrees, 7 m, for a second, and a fainter one at -90 degrees."""
+    """Return a stream with a vehicle at 45 degrees, 7 m, for 1 s, and a fainter one at -90 degrees."""
     time_s = np.round(np.arange(1.0, 3.0, 0.1), 1)
     places = ((1, 5.0, 5.0, 70.0), (2, 0.0, -9.0, 60.0))
     rows = [(number, t, x, y, t < 2.0, level) for number, x, y, level in places for t in time_s]
@@ -84,7 +84,7 @@ def passing(bearing_deg: float) -> HeardStream:
     return HeardStream(hops, HopTable({}), HopTable.of_rows(names, rows))
 
 
-def test_bearings_are_held_against_the_loudest_vehicle_in_view() -> None:
+def test_bearings_are_compared_with_the_loudest_vehicle_in_view() -> None:
     assert in_view_bearings([passing(48.0)])["bearing_error_deg"] == pytest.approx(3.0)
     two_to_one = [passing(48.0), passing(38.0), passing(38.0)]
     assert in_view_bearings(two_to_one)["bearing_error_deg"] == pytest.approx(7.0)
@@ -93,7 +93,7 @@ def test_bearings_are_held_against_the_loudest_vehicle_in_view() -> None:
     assert in_view_bearings([nobody]) == dict.fromkeys(in_view_bearings([unseen]))
 
 
-def test_an_offset_of_the_clocks_is_worth_what_a_vehicle_turns_meanwhile() -> None:
+def test_a_clock_offset_equals_the_turn_of_a_vehicle() -> None:
     turning = passing(0.0)
     azimuth = np.radians(30.0) * turning.rows.time_s
     rows = turning.rows.replace(x_m=7.0 * np.cos(azimuth), y_m=7.0 * np.sin(azimuth))

@@ -1,4 +1,4 @@
-"""Clips of a user's own: what is learned of them, who counts how much, and what is refused."""
+"""Clips of users: learning, weights and errors."""
 
 import csv
 from pathlib import Path
@@ -25,7 +25,7 @@ def table(folder: Path, rows: list[tuple[str, ...]]) -> Path:
 
 
 def pump(path: Path, seed: int) -> str:
-    """Write a machine that the simulator does not have: noise in twenty strokes a second."""
+    """Write a machine that the simulator lacks: noise of twenty strokes per second."""
     rng, time = np.random.default_rng(seed), np.arange(4 * RATE) / RATE
     noise = np.convolve(rng.standard_normal(len(time)), np.ones(int(rng.integers(3, 9))), "same")
     strokes = 1.0 + 0.7 * np.sin(2.0 * np.pi * rng.uniform(18.0, 22.0) * time)
@@ -34,7 +34,7 @@ def pump(path: Path, seed: int) -> str:
 
 
 def simulated() -> SoundRows:
-    """Render some close clips: streets, foreign sounds and signals."""
+    """Render close clips of streets, foreign sounds and signals."""
     names = [*("light", "idling light", "heavy", "voice", "dog", "music", "siren", "horns")] * 3
     draws = zip(names, range(len(names)), np.random.default_rng(5).spawn(len(names)), strict=True)
     return SoundRows.joined([rows_of_clip(6000.0, one) for one in draws])
@@ -45,7 +45,7 @@ def foreign_share(guard: DomainGuard, measures: np.ndarray) -> float:
 
 
 @pytest.mark.long
-def test_a_new_foreign_sound_is_called_foreign_more_often_where_it_was_not_heard(tmp_path: Path) -> None:
+def test_a_learned_foreign_sound_is_detected_more_often(tmp_path: Path) -> None:
     rows = [(pump(tmp_path / f"{n}.wav", n), "pump", f"r{n}", "") for n in range(8)]
     learned = read_recorded(tmp_path, table(tmp_path, rows))
     held_out = np.concatenate(
@@ -56,12 +56,12 @@ def test_a_new_foreign_sound_is_called_foreign_more_often_where_it_was_not_heard
     after = fit_guard(of_guard(SoundRows.joined([base, learned.rows])))
     assert "pump" in after.foreign and "pump" not in before.foreign
     assert foreign_share(after, held_out) > foreign_share(before, held_out) + 0.2
-    # Vehicles are the street as before.
+    # Vehicles still count as street.
     street = base.select(np.isin(base.kinds, ["light", "heavy"])).measures
     assert foreign_share(after, street) < foreign_share(before, street) + 0.05
 
 
-def test_every_recording_counts_as_much_however_long_and_under_whichever_name(tmp_path: Path) -> None:
+def test_recordings_have_equal_weight(tmp_path: Path) -> None:
     rows = [
         (pump(tmp_path / f"{n}.wav", n), *rest)
         for n, rest in enumerate(
@@ -109,7 +109,7 @@ def test_every_recording_counts_as_much_however_long_and_under_whichever_name(tm
     assert set(of_guard(learned.rows).kinds.tolist()) == {CLOSE, "pump", "siren", "beeper", "voice"}
 
 
-def test_buses_of_free_recordings_are_trucks_and_every_file_is_a_recording(tmp_path: Path) -> None:
+def test_buses_of_free_recordings_count_as_trucks(tmp_path: Path) -> None:
     path, free = tmp_path / "clips.csv", "Creative Commons 0"
     rows = [(pump(tmp_path / f"{n}.wav", n), kind, free) for n, kind in enumerate(("bus", "bus", "tram"))]
     with path.open("w", newline="") as file:
@@ -125,7 +125,7 @@ def test_buses_of_free_recordings_are_trucks_and_every_file_is_a_recording(tmp_p
         learned.licences == (free,)
         and f"3 recordings beside the simulation (bus 2, tram 1; {free}" in learned.told
     )
-    # What is learned from CC0 is the project's own; one recording of no licence changes that.
+    # A model of CC0 recordings belongs to the project; one recording without a licence changes that.
     assert "not the project's own" not in learned.told
     with path.open("a", newline="") as file:
         csv.writer(file).writerow((pump(tmp_path / "3.wav", 3), "bus", ""))
@@ -142,7 +142,7 @@ def test_buses_of_free_recordings_are_trucks_and_every_file_is_a_recording(tmp_p
         (None, "at least one clip"),
     ],
 )
-def test_what_cannot_be_learned_is_refused(tmp_path: Path, row: tuple[str, ...] | None, told: str) -> None:
+def test_wrong_tables_of_clips_raise_an_error(tmp_path: Path, row: tuple[str, ...] | None, told: str) -> None:
     pump(tmp_path / "a.wav", 1)
     with pytest.raises(InputFileError, match=told):
         read_recorded(tmp_path, table(tmp_path, [] if row is None else [row]))

@@ -1,4 +1,4 @@
-"""Training on rows whose clusters are known, and on one junction of the simulator."""
+"""Training of road users on known clusters and one simulated junction."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ N_INPUTS, EACH, SITES = len(MEASURES) + len(BANDS), 100, ("one", "two", "three")
 
 
 def made_up_rows(seed: int, apart: float = 4.0) -> RoadUserRows:
-    """Draw clusters: each kind on an axis of its own, the inaudible at the origin."""
+    """Draw clusters: each kind on its own axis, inaudible vehicles at the origin."""
     rng = np.random.default_rng(seed)
     kinds = np.array([kind for kind in CLASS_OF for _ in range(EACH)] * len(SITES))
     audible = rng.random(len(kinds)) < 0.8
@@ -38,24 +38,24 @@ def made_up_rows(seed: int, apart: float = 4.0) -> RoadUserRows:
     return RoadUserRows(measures, kinds, sites, audible, rng.random(len(kinds)) < 0.9)
 
 
-def test_classes_that_differ_are_told_and_such_that_do_not_are_the_towns_shares() -> None:
+def test_distinct_classes_are_separated_and_equal_ones_have_the_prior() -> None:
     rows, fresh = made_up_rows(1), made_up_rows(2)
     found = road_user_exam(rows)
     assert found.log_loss < 0.7 * found.prior_log_loss
     assert found.recall_of_equals[:-1].min() > 0.5
     np.testing.assert_allclose(found.confusion.sum(axis=1), 1.0, atol=1e-9)
-    # Classes are said as often as they come in a town, though kinds are drawn equally often.
+    # Classes have the shares of a town, although kinds are drawn equally often.
     said = fit_road_users(rows).probabilities(fresh.measures)
     expected = np.average(said, axis=0, weights=fresh.weights)
     np.testing.assert_allclose(expected, town_shares(fresh), atol=0.1)
-    # Nothing is to be learned of labels dealt by chance.
+    # Random labels have nothing to learn.
     dealt = replace(rows, kinds=np.random.default_rng(3).permutation(rows.kinds))
     nothing = road_user_exam(replace(dealt, measures=made_up_rows(4, apart=0.0).measures))
     assert nothing.log_loss > 0.8 * nothing.prior_log_loss
 
 
 @pytest.mark.slow
-def test_vehicles_of_the_simulator_are_heard_before_they_are_seen_and_bicycles_hardly() -> None:
+def test_simulated_vehicles_are_audible_before_sight() -> None:
     rows = road_user_rows(ovad_array(), ["SB1"], 6000.0, np.random.default_rng(1))
     names = np.array(CLASSES)[rows.classes]
     audible = {
@@ -69,8 +69,8 @@ def test_vehicles_of_the_simulator_are_heard_before_they_are_seen_and_bicycles_h
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["light", "tram"])
-def test_kinds_do_not_hang_on_a_recorder_that_rises_or_falls(kind: str) -> None:
-    """Fresh clips through a filter of 6 dB from 80 to 2,700 Hz, by the model that ships."""
+def test_kinds_are_robust_to_the_slope_of_a_recorder(kind: str) -> None:
+    """New clips through a filter of 6 dB from 80 to 2,700 Hz with the shipped model."""
     model, rng, rate_hz = read_model().road_users, np.random.default_rng(3), 6000.0
     assert model is not None
     street = StreamSettings(junction_named("SA1"), 1.0, sample_rate_hz=rate_hz)

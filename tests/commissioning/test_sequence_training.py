@@ -1,4 +1,4 @@
-"""Boosted trees as arrays against scikit-learn's own, the margin of times, and learning in processes."""
+"""Boosted trees as arrays against scikit-learn, the margin of times, and parallel learning."""
 
 from types import SimpleNamespace
 
@@ -30,7 +30,7 @@ from worldstate.operations.recordings.hop_table import HopTable
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("sizes", [(6,), (4, 9), (8, 3, 5)])
-def test_exported_trees_are_the_geometric_mean_of_classifiers(seed: int, sizes: tuple[int, ...]) -> None:
+def test_exported_trees_equal_the_geometric_mean_of_classifiers(seed: int, sizes: tuple[int, ...]) -> None:
     rng = np.random.default_rng(seed)
     inputs, groups = rng.normal(size=(400, 7)), rng.choice([0, 3, 14], 400)
     machines = [
@@ -50,7 +50,7 @@ def test_exported_trees_are_the_geometric_mean_of_classifiers(seed: int, sizes: 
 
 
 def _stream(rng: np.random.Generator, hops: int = 1200) -> tuple[np.ndarray, StreamTruth]:
-    """Return a made-up street where evidence of the left side rises before somebody comes, every 12 s."""
+    """Return a synthetic street whose evidence of the left rises before a vehicle, every 12 s."""
     time_s = 0.1 * np.arange(hops)
     coming = np.stack([12.0 - time_s % 12.0, np.full(hops, np.inf)], axis=1)
     rises = np.clip(3.0 - coming[:, 0], -2.0, 3.0)
@@ -62,8 +62,8 @@ def _stream(rng: np.random.Generator, hops: int = 1200) -> tuple[np.ndarray, Str
 
 
 @pytest.mark.parametrize("background_db", [-10.0, 0.0, 8.0])
-def test_a_vehicle_far_away_counts_by_its_level_over_the_background(background_db: float) -> None:
-    """A quiet street lets a fainter one be heard; labelled as empty it would teach that nothing is there."""
+def test_distant_vehicles_are_weighted_by_level_over_background(background_db: float) -> None:
+    """Fainter vehicles are audible in a quiet street and must not be labelled empty."""
     hops = 12
     rising_db = 48.0 + background_db + np.linspace(-6.0, 6.0, hops)
     columns = {"time_s": 0.1 * np.arange(hops)}
@@ -82,7 +82,7 @@ def test_a_vehicle_far_away_counts_by_its_level_over_the_background(background_d
 
 
 @pytest.mark.long
-def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten() -> None:
+def test_a_trained_sequence_detects_and_has_90_per_cent_intervals() -> None:
     rng = np.random.default_rng(5)
     learned = [
         LabelledStream.of(sequence_inputs(heard), truth) for heard, truth in (_stream(rng), _stream(rng))
@@ -95,7 +95,7 @@ def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten()
     assert np.isclose(model.share.sum(), 1.0, atol=1e-4) and said.groups.shape == (1200, 2, len(GROUPS))
     soon = coming_to.coming_s[:, 0] <= 1.0
     within = said.within()[:, 0, -1]
-    # A few rounds that are held back are not sure of anything yet; they know which hops are which.
+    # A few regularised rounds give no certainty, but they separate the hops.
     assert within[soon].mean() > 0.2 > 2 * within[coming_to.coming_s[:, 0] > 6.0].mean()
     times, coming = said.time_to_visible_s(), coming_to.coming_s <= LONGEST_S
     low, _, high = times[coming].T
@@ -104,14 +104,14 @@ def test_a_trained_sequence_tells_who_comes_and_its_intervals_hold_nine_of_ten()
 
 
 def levels_of_readings(calm: tuple[object, object, SequenceModel, FloatArray]) -> FloatArray:
-    """Without sound there are no windows: the alarm goes by the readings alone."""
+    """Without sound there are no windows, so the alarm depends on the readings only."""
     _, _, model, found = calm
     return smoothed_log_odds(model.posterior(found))
 
 
 @given(st.lists(st.integers(10, 40_000), min_size=1, max_size=8), st.booleans())
-def test_more_sound_bears_more_trees_up_to_those_that_were_chosen(hops: list[int], moves: bool) -> None:
-    """Of seven minutes (--quick) a tenth of the trees: all of them took most of its time."""
+def test_the_number_of_trees_grows_with_the_sound(hops: list[int], moves: bool) -> None:
+    """Seven minutes (--quick) use a tenth of the trees, which otherwise took most of the time."""
     streams = [SimpleNamespace(hops=range(n), ego_moves=moves) for n in hops]
     sizes, few = (MOVING if moves else STANDING), commission.dealt_growth(streams[:1])
     for most, less, every in zip(sizes, few, commission.dealt_growth(streams), strict=True):
@@ -123,7 +123,7 @@ def test_more_sound_bears_more_trees_up_to_those_that_were_chosen(hops: list[int
 
 
 @pytest.mark.long
-def test_what_is_learned_does_not_depend_on_how_many_processes_learn(monkeypatch) -> None:
+def test_learning_does_not_depend_on_the_number_of_processes(monkeypatch) -> None:
     rng = np.random.default_rng(3)
     streets = [
         SimpleNamespace(site=f"SA{i // 2}", hazard_free=bool(i % 2), hops=range(600), ego_moves=False)

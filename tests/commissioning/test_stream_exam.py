@@ -1,4 +1,4 @@
-"""An exam of made-up streams, counted by hand: who is detected, when, on which side, and what alarms cost."""
+"""Exams of synthetic streams against counts by hand."""
 
 import math
 from collections import Counter
@@ -56,7 +56,7 @@ SOON = GROUPS.index("coming_1s")
 
 
 def heard(vehicles: list[Vehicle], duration_s: float = 60.0, site: str = "SB1") -> HeardStream:
-    """Return a stream in which every vehicle is heard for eight seconds before its T0 and three after it."""
+    """Return a stream in which each vehicle is audible from 8 s before to 3 s after its T0."""
     rows = []
     for number, (_, _, arm, entry_s) in enumerate(vehicles):
         for time_s in np.round(np.arange(max(entry_s - 8.0, 0.0), entry_s + 3.0, 0.1), 1):
@@ -80,7 +80,7 @@ def heard(vehicles: list[Vehicle], duration_s: float = 60.0, site: str = "SB1") 
 
 
 def examined(stream: HeardStream, spans: list[tuple[float, float, int]]) -> ExaminedStream:
-    """Return a stream with a posterior that is sure of a side in some spans, and the advisories of these."""
+    """Return a stream with a certain posterior of a side in spans, and its advisories."""
     time_s = stream.hops.time_s
     groups = np.full((len(time_s), 2, len(GROUPS)), 1e-4)
     groups[..., FREE] = 1.0
@@ -100,7 +100,7 @@ VEHICLES: list[Vehicle] = [
 ]
 
 
-def test_approaches_are_put_together_by_who_came_with_whom() -> None:
+def test_simultaneous_vehicles_form_one_approach() -> None:
     found = approaches(heard([*VEHICLES, ("left", "bicycle", "left", 55.0)]))
     assert [(one.flow, one.entries_s, one.sides, one.quiet) for one in found] == [
         ("single", (10.0,), (0,), False),
@@ -116,10 +116,8 @@ KINDS = st.sampled_from(["light", "medium", "heavy", "electric", "bicycle", "sco
 
 @given(st.lists(st.tuples(KINDS, st.booleans()), min_size=1, max_size=8))
 @settings(max_examples=20, deadline=None)
-def test_the_card_has_the_share_of_each_kind_that_was_detected_by_the_name_that_users_know(
-    drawn: list[tuple[str, bool]],
-) -> None:
-    """An oracle that counts: vehicles 20 s apart, each with an alarm before T0 or without one."""
+def test_the_card_has_the_recall_of_each_kind(drawn: list[tuple[str, bool]]) -> None:
+    """Oracle: counts of vehicles 20 s apart, each with or without an alarm before T0."""
     told = {"light": "car", "medium": "van", "heavy": "truck"}
     every: list[Vehicle] = [("left", kind, "left", 20.0 * (i + 1)) for i, (kind, _) in enumerate(drawn)]
     alarms = [(one[3] - 2.0, one[3], 0) for one, (_, found) in zip(every, drawn, strict=True) if found]
@@ -134,7 +132,7 @@ def test_the_card_has_the_share_of_each_kind_that_was_detected_by_the_name_that_
 
 @given(st.integers(2, 60), st.integers(0, 2**32 - 1), st.booleans())
 @settings(max_examples=30, deadline=None)
-def test_an_array_has_its_own_real_figures_or_the_gap_that_another_one_has(
+def test_an_array_has_real_figures_or_the_gap_of_another_array(
     microphones: int, seed: int, moving: bool
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -147,7 +145,7 @@ def test_an_array_has_its_own_real_figures_or_the_gap_that_another_one_has(
     assert real_figures(other, moving_ego=moving) == gap
 
 
-def test_a_second_vehicle_belongs_to_the_first_however_near_the_next_approach_is() -> None:
+def test_a_second_vehicle_belongs_to_its_first() -> None:
     pairs: list[Vehicle] = [
         *(("both", "light", "left", 10.0), ("both", "light", "right", 15.9)),
         *(("both", "light", "right", 16.5), ("both", "light", "left", 22.4)),
@@ -157,8 +155,8 @@ def test_a_second_vehicle_belongs_to_the_first_however_near_the_next_approach_is
     assert [one.entries_s for one in found] == [(10.0, 15.9), (16.5, 22.4), (40.0, 46.2)]
 
 
-def test_an_alarm_counts_from_the_horizon_of_the_risk_on_or_from_less() -> None:
-    """What a stream's vehicle is announced by seven seconds ahead is not about something else."""
+def test_an_alarm_counts_within_the_horizon() -> None:
+    """An alarm seven seconds before a vehicle is about that vehicle."""
     stream = heard([("left", "light", "left", 20.0)])
     time_s = stream.hops.time_s
     raised = np.column_stack([(time_s > 12.95) & (time_s < 14.5), np.zeros(len(time_s), bool)])
@@ -169,10 +167,8 @@ def test_an_alarm_counts_from_the_horizon_of_the_risk_on_or_from_less() -> None:
 
 
 @given(seed=st.integers(0, 2**32), t0_s=st.floats(10.0, 20.0), share=st.floats(0.0, 1.0))
-def test_an_alarm_stands_at_t0_if_it_is_on_in_the_last_hop_before_it(
-    seed: int, t0_s: float, share: float
-) -> None:
-    """Of either side; whatever is raised from T0 on, or a second and more before it, changes nothing."""
+def test_an_alarm_at_t0_is_that_of_the_last_hop_before(seed: int, t0_s: float, share: float) -> None:
+    """Alarms from T0 on, or over a second before it, change nothing, on either side."""
     rng, time_s = np.random.default_rng(seed), np.round(np.arange(1.0, 30.0, 0.1), 1)
     raised = rng.random((len(time_s), 2)) < share * rng.random()
     found = hop_outcome(StreamApproach("single", (t0_s,), (0,)), time_s, raised)
@@ -184,7 +180,7 @@ def test_an_alarm_stands_at_t0_if_it_is_on_in_the_last_hop_before_it(
     assert shares == {"advised_last_second": found.last_second / 2, "advised_at_t0": found.at_t0 / 2}
 
 
-def test_an_approach_of_a_drive_counts_however_soon_the_vehicle_comes_out() -> None:
+def test_approaches_of_a_drive_count_at_any_time() -> None:
     # Drives last 18 s, and their vehicles come out after six to eight.
     soon: list[Vehicle] = [("left", "car", "left", 6.2)]
     drive, standing = (heard(soon, 18.0, site=name) for name in ("DA1", "SB1"))
@@ -192,12 +188,12 @@ def test_an_approach_of_a_drive_counts_however_soon_the_vehicle_comes_out() -> N
     assert examine([examined(standing, [(4.0, 6.0, 0)])])["approaches"] == 0
 
 
-def test_figures_are_those_counted_by_hand() -> None:
+def test_figures_equal_counts_by_hand() -> None:
     spans = [
-        (8.2, 9.5, 0),  # the first: detected, some two seconds before
-        (19.0, 21.0, 0),  # the second: on the wrong side alone
+        (8.2, 9.5, 0),  # the first: detected about two seconds before
+        (19.0, 21.0, 0),  # the second: on the wrong side only
         *((33.0, 33.8, 0), (34.0, 34.6, 1)),  # both sides
-        (51.0, 52.0, 0),  # nobody: the queue is missed, and warned of when it is over
+        (51.0, 52.0, 0),  # no vehicle: the queue is missed, and the alarm comes after it
     ]
     figures = examine(
         [examined(heard(VEHICLES), spans), examined(heard([]), [(20.0, 20.5, 1), (40.0, 41.0, 0)])]
@@ -223,8 +219,8 @@ def test_figures_are_those_counted_by_hand() -> None:
     assert figures["lead_missed_as_0_s"] == pytest.approx(0.75 * float(figures["lead_s"] or 0.0))
 
 
-def test_each_renderer_has_figures_of_its_own() -> None:
-    """One that is easy must not hide another one that is not."""
+def test_each_renderer_has_its_own_figures() -> None:
+    """An easy renderer must not hide a hard one."""
     found, missed = [(8.0, 12.0, 0)], list[tuple[float, float, int]]()
     streams = [
         examined(heard([("left", "light", "left", 12.0)], 30.0, site), spans)
@@ -235,7 +231,7 @@ def test_each_renderer_has_figures_of_its_own() -> None:
     assert named == [1.0, 0.0, 0.5] and figures["approaches"] == 1
 
 
-def test_the_worst_junction_stands_beside_the_mean() -> None:
+def test_the_worst_junction_is_beside_the_mean() -> None:
     good = [examined(heard(VEHICLES[:2]), [(8.0, 9.9, 0), (20.0, 21.9, 1)]), examined(heard([]), [])]
     bad = [
         examined(heard(VEHICLES[:2], site="SA1"), [(8.0, 9.9, 0)]),
@@ -250,7 +246,7 @@ def test_the_worst_junction_stands_beside_the_mean() -> None:
     assert none["onsets_per_hour_worst_junction"] is None and none["detected_worst_junction"] == 1.0
 
 
-def test_curves_say_who_is_warned_by_then() -> None:
+def test_curves_have_the_share_warned_by_a_time() -> None:
     streams = [examined(heard(VEHICLES[:2]), [(7.0, 9.9, 0), (21.0, 21.9, 1)]), examined(heard([]), [])]
     before_s = np.array([0.0, 0.5, 2.0, 4.0])
     np.testing.assert_array_equal(warned_before(streams, before_s), [1.0, 1.0, 0.5, 0.0])
@@ -258,7 +254,7 @@ def test_curves_say_who_is_warned_by_then() -> None:
 
 
 def levels(seed: int, junctions: int, streams: int = 2) -> dict[str, list[FloatArray]]:
-    """Return hazard-free streams of half a minute that wander, at some junctions louder, or denied."""
+    """Return hazard-free streams of half a minute at junctions, some louder or denied."""
     rng, found = np.random.default_rng(seed), dict[str, list[FloatArray]]()
     for junction in range(junctions):
         louder = rng.normal(0.0, 2.0)
@@ -268,7 +264,7 @@ def levels(seed: int, junctions: int, streams: int = 2) -> dict[str, list[FloatA
 
 
 def counted(streams: list[FloatArray], threshold_nats: float) -> tuple[float, float]:
-    """Return onsets an hour and the share of hops in alarm, hop by hop."""
+    """Return onsets per hour and the share of hops in alarm, hop by hop."""
     onsets = alarmed = 0
     for one in streams:
         left = 0
@@ -291,7 +287,7 @@ def test_the_points_of_a_curve_are_counts_and_no_rate_falls(seed: int, junctions
     streams = [one for there in quiet.values() for one in there]
     curve = measured_curve(quiet)
     direct = np.array([counted(streams, one) for one in curve.threshold_nats.tolist()])
-    # Alarms that grow together are one onset: the most so far counts.
+    # Alarms that merge are one onset, so the maximum so far counts.
     assert curve.onsets_per_hour == pytest.approx(np.maximum.accumulate(direct[:, 0]))
     assert curve.alpha == pytest.approx(direct[:, 1])
     for rates in ("onsets", "alpha"):
@@ -302,9 +298,7 @@ def test_the_points_of_a_curve_are_counts_and_no_rate_falls(seed: int, junctions
 
 @CURVES
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_an_alarm_keeps_what_was_asked_on_its_own_streams_and_no_lower_point_does(
-    seed: int, budget: float, share: float
-) -> None:
+def test_the_alarm_is_the_lowest_threshold_within_the_budget(seed: int, budget: float, share: float) -> None:
     quiet = levels(seed, 4)
     streams = [one for there in quiet.values() for one in there]
     curve = measured_curve(quiet)
@@ -331,10 +325,8 @@ def test_an_alarm_keeps_what_was_asked_on_its_own_streams_and_no_lower_point_doe
 
 @CURVES
 @given(st.integers(0, 2**32 - 1), st.integers(3, 7), st.floats(60.0, 1200.0))
-def test_a_budget_for_other_junctions_is_kept_by_those_left_out_and_is_that_of_risk_control(
-    seed: int, junctions: int, rate: float
-) -> None:
-    # Whatever the streams, over all ways to leave one out, which is what exchangeable junctions are.
+def test_budgets_for_other_junctions_hold_on_left_out_ones(seed: int, junctions: int, rate: float) -> None:
+    # For any streams, over all ways to leave one out, as for exchangeable junctions.
     quiet, rates = levels(seed, junctions), list[float]()
     for name in quiet:
         others = {other: streams for other, streams in quiet.items() if other != name}
@@ -344,7 +336,7 @@ def test_a_budget_for_other_junctions_is_kept_by_those_left_out_and_is_that_of_r
     curve = measured_curve(quiet, elsewhere=True)
     losses = [[counted(one, level)[0] for level in curve.threshold_nats.tolist()] for one in quiet.values()]
     assert (np.maximum(curve.onsets_low, curve.onsets_per_hour) <= curve.onsets_high).all()
-    # Another implementation of the same bound. Alarms that grow together are one: the worst so far counts.
+    # Another implementation of the same bound. Merged alarms are one, so the maximum so far counts.
     worst = np.maximum.accumulate(np.minimum(losses, LOUDEST * rate), axis=1) / (LOUDEST * rate)
     points = np.arange(worst.shape[1], dtype=float)
     _, bound = get_r_hat_plus(worst, points, "crc", None, None, None)
@@ -353,7 +345,7 @@ def test_a_budget_for_other_junctions_is_kept_by_those_left_out_and_is_that_of_r
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 60))
-def test_more_onsets_ask_for_no_smaller_budget_of_however_many_junctions(seed: int, junctions: int) -> None:
+def test_budgets_are_monotone_in_the_onsets(seed: int, junctions: int) -> None:
     rng = np.random.default_rng(seed)
     counts = rng.poisson(0.02, (junctions, 200)).cumsum(axis=1)
     budgets = budgets_elsewhere(counts / rng.uniform(0.01, 0.3, (junctions, 1)))
@@ -369,7 +361,7 @@ OF_A_MODEL = {
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(-2.0, 1.0), st.fixed_dictionaries(OF_A_MODEL))
-def test_the_levels_of_a_stream_raise_what_the_filter_of_the_model_advises_of_at_any_threshold(
+def test_levels_of_a_stream_reproduce_the_advisories_of_the_filter(
     seed: int, threshold_nats: float, numbers: dict[str, float]
 ) -> None:
     rng, of_model = np.random.default_rng(seed), replace(StreetModel(), **numbers)
@@ -389,7 +381,7 @@ def test_the_levels_of_a_stream_raise_what_the_filter_of_the_model_advises_of_at
 
     told = advised(states(SequenceAlarm(threshold_nats, 20.0))).any(axis=1)
     model = replace(read_model(), street=of_model)
-    with pytest.MonkeyPatch.context() as patch:  # A stream is heard as `measured` has it
+    with pytest.MonkeyPatch.context() as patch:  # The stream has the measurements of `measured`.
         patch.setattr(commission, "stream_evidence", lambda windows, stream: None)
         patch.setattr(
             alarm_curve, "measurements", lambda stream, windows, silent, *_, **__: measured(silent.alarm)
@@ -398,7 +390,7 @@ def test_the_levels_of_a_stream_raise_what_the_filter_of_the_model_advises_of_at
     np.testing.assert_array_equal(raised_at(levels, threshold_nats), told)
 
 
-def test_a_curve_that_no_count_has_is_refused() -> None:
+def test_inconsistent_curves_raise_an_error() -> None:
     good = measured_curve(levels(1, 3))
     for wrong in (
         {"hours": 0.0},
@@ -411,7 +403,7 @@ def test_a_curve_that_no_count_has_is_refused() -> None:
             replace(good, **wrong)
 
 
-def test_two_junctions_keep_for_another_what_neither_of_them_has() -> None:
+def test_two_quiet_junctions_give_a_threshold_without_alarms() -> None:
     quiet = levels(7, 2)
     curve = measured_curve(quiet, elsewhere=True)
     streams = [one for there in quiet.values() for one in there]
@@ -419,15 +411,15 @@ def test_two_junctions_keep_for_another_what_neither_of_them_has() -> None:
     assert counted(streams, curve.default(20.0).threshold_nats) == (0.0, 0.0)
 
 
-def test_one_junction_sets_no_alarm_for_others() -> None:
+def test_one_junction_gives_no_threshold_for_others() -> None:
     with pytest.raises(InvalidArgumentError, match="at least 2 junctions, got 1"):
         measured_curve(levels(0, 1, 3), elsewhere=True)
 
 
-def test_the_interval_of_a_curve_holds_the_rate_of_four_other_junctions_as_often_as_it_states() -> None:
+def test_the_interval_of_a_curve_has_its_stated_coverage() -> None:
     rng, inside = np.random.default_rng(6), list[bool]()
     for _ in range(100):
-        # Peaks as often as a gamma distribution gives each of sixteen junctions, half as wide as its mean.
+        # Peaks of sixteen junctions with gamma rates, half as wide as their mean.
         often, hops = rng.gamma(4.0, 0.001, 16), [1500] * 12 + [8000] * 4
         streams = [
             np.where(rng.random(n) < p, rng.exponential(1.0, n), -50.0)
@@ -440,7 +432,7 @@ def test_the_interval_of_a_curve_holds_the_rate_of_four_other_junctions_as_often
     assert 0.88 <= np.mean(inside) <= 0.99
 
 
-def test_who_is_missed_throughout_the_last_second_ranks_with_nobody() -> None:
+def test_a_vehicle_missed_in_the_last_second_ranks_as_empty() -> None:
     streams = [examined(heard(VEHICLES[:2]), [(7.5, 9.9, 0)]), examined(heard([]), [])]
     figures = examine(streams)
     assert figures["auroc_last_second"] == pytest.approx(0.75, abs=0.01)
@@ -449,18 +441,18 @@ def test_who_is_missed_throughout_the_last_second_ranks_with_nobody() -> None:
     assert examine(streams[:1])["auroc_last_second"] is None
 
 
-def test_no_two_junctions_of_a_plan_share_their_drivers_and_no_exam_shares_any_with_it() -> None:
+def test_junctions_and_exams_share_no_random_draws() -> None:
     plans = [CommissionSettings(seed=seed, junctions=40) for seed in (1, 2)]
     learned = {one.name: one.seed for plan in plans for one in learned_streams(plan)}
     exams = {one.name: one.seed for plan in plans for one in exam_streams(plan)}
-    # Approaches and the hazard-free stream of a junction are different traffic under one seed.
-    # As many junctions of each renderer, each with weather and without.
+    # Approaches and the hazard-free stream of a junction are different traffic with one seed.
+    # The same number of junctions per renderer, each with and without weather.
     assert len(set(learned.values())) == 2 * 2 * 3 * 40 and len(set(exams.values())) == 2 * (5 + 5 + 5)
     assert not set(learned.values()) & set(exams.values())
     assert not {one.split("-")[0] for one in learned} & {one.split("-")[0] for one in exams}
 
 
-def test_a_model_learns_each_flow_in_weather_that_varies_and_is_examined_in_the_published_one() -> None:
+def test_training_varies_the_weather_and_the_exam_does_not() -> None:
     learned, exam = learned_streams(CommissionSettings()), exam_streams(CommissionSettings())
     came = {flow for one in learned for flow, rate in one.traffic.per_hour.items() if rate}
     assert came >= {"left", "both", "queue", "stops", "turns_away", "far", "distant", "leaves", "stands"}
@@ -479,7 +471,7 @@ def test_a_model_learns_each_flow_in_weather_that_varies_and_is_examined_in_the_
     assert all(one.drawn_preset == one.preset and one.rain_db is None for one in exam)
 
 
-def test_a_moving_ego_drives_again_and_again_and_no_drive_is_another() -> None:
+def test_drives_of_a_moving_ego_all_differ() -> None:
     chosen = CommissionSettings(moving_ego=True, junctions=3, approach_minutes=1.5, hazard_free_minutes=1.0)
     learned, exam = learned_streams(chosen), exam_streams(chosen)
     others = {f"D{letter}{plan}" for letter in "TM" for plan in ("A911", "B911", "A912", "B912", "A913")}
@@ -494,6 +486,6 @@ def test_a_moving_ego_drives_again_and_again_and_no_drive_is_another() -> None:
         for traffic in ("approaches", "no-hazard")
     }
     assert minutes == {"approaches": pytest.approx(3 * 4.5), "no-hazard": pytest.approx(3 * 3.0)}
-    # A seed is shared by an approach and a hazard-free drive, which are different traffic.
+    # An approach and a hazard-free drive share a seed and have different traffic.
     assert len({one.seed for one in learned}) == 3 * 3 * 5
     assert not {one.seed for one in learned} & {one.seed for one in exam}

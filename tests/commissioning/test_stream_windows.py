@@ -1,4 +1,4 @@
-"""Windows cut from streams whose truth was written by hand, and windows of sources in the open."""
+"""Windows of streams with known truth, and of sources in the open."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ TIME_S = np.round(np.arange(1.0, 60.0, 0.1), 1)
 
 
 def stream(*vehicles, site="SA1", rng=None):
-    """Vehicles by kind, arm and entry, each in view near by for three seconds."""
+    """Return vehicles by kind, arm and entry, each in view for three seconds."""
     features = np.ones((len(TIME_S), 60)) if rng is None else rng.uniform(0.05, 0.9, (len(TIME_S), 60))
     hops = HopTable({"time_s": TIME_S, "feature": features}, about={"site": site})
     names = ("vehicle", "flow", "kind", "arm", "entry_s", "hazard")
@@ -46,21 +46,21 @@ def label_at(labels, time_s):
     return labels[np.abs(TIME_S - time_s).argmin()]
 
 
-def test_a_window_says_who_comes_out_of_which_arm_and_how_soon():
+def test_windows_have_kind_arm_and_time_of_a_vehicle():
     labels = hop_labels(stream(("light", "left", 20.0), ("light", "right", 40.0)))
     times = {5.0: "none", 18.5: "", 19.5: "left", 20.0: "left", 20.2: "", 21.5: "front", 39.5: "right"}
     assert {time: label_at(labels, time) for time in times} == times
-    # A second that ends after the vehicle was seen holds its sound: no empty window follows at once.
+    # A second that ends after sight contains the vehicle, so no empty window follows at once.
     assert label_at(labels, 23.5) == "" and label_at(labels, 24.2) == "none"
 
 
-def test_windows_of_a_moving_ego_lie_half_a_second_later():
+def test_windows_of_a_moving_ego_are_half_a_second_later():
     labels = hop_labels(stream(("light", "left", 20.0), site="DA1"))
     times = {18.5: "", 19.5: "left", 20.5: "left", 20.7: "", 21.5: "front", 24.2: "none"}
     assert {time: label_at(labels, time) for time in times} == times
 
 
-def test_two_that_come_within_a_second_and_a_half_are_both_and_two_far_apart_are_not():
+def test_two_vehicles_within_1_5_s_are_labelled_both():
     near = hop_labels(stream(("light", "left", 30.0), ("light", "right", 31.2)))
     assert {label_at(near, time) for time in (29.2, 29.9)} == {"both"}
     # In view, the first covers the second.
@@ -69,14 +69,14 @@ def test_two_that_come_within_a_second_and_a_half_are_both_and_two_far_apart_are
     assert label_at(far, 29.5) == "left" and label_at(far, 34.9) == "right"
 
 
-def test_a_bicycle_is_no_hidden_window_and_no_empty_one_either():
+def test_a_bicycle_gives_neither_hidden_nor_empty_windows():
     labels = hop_labels(stream(("bicycle", "left", 30.0)))
     assert {label_at(labels, time) for time in (26.0, 29.0, 30.0)} == {""}
     beside = hop_labels(stream(("bicycle", "left", 30.0), ("light", "right", 30.2)))
     assert label_at(beside, 29.8) == ""
 
 
-def test_classes_weigh_as_in_the_released_windows_and_a_site_is_compared_with_itself():
+def test_classes_have_the_weights_of_the_released_windows():
     rng = np.random.default_rng(1)
     parts = [stream(("light", "left", 30.0), site=site, rng=rng) for site in ("SA1", "SB1")]
     found = stream_windows(parts)
@@ -86,13 +86,13 @@ def test_classes_weigh_as_in_the_released_windows_and_a_site_is_compared_with_it
     assert (found.weights[hidden] == WEIGHT).all()
     alone = stream_windows(parts[:1])
     np.testing.assert_array_equal(found.at(["SA1"]).X, alone.X)
-    # Told apart by site: an open field belongs to none and is always there.
+    # Separated by site: an open field belongs to none and is always present.
     everything = SimulatedWindows.joined([found, open_field_windows(np.ones((3, 60)))])
     assert len(everything.at(["SB1"]).y) == (found.sites == "SB1").sum() + 3
     assert len(everything.at([]).y) == 3
 
 
-def test_along_a_stream_posteriors_are_those_of_the_running_model():
+def test_posteriors_of_a_stream_equal_those_of_the_running_model():
     model, features = read_model().signature, np.random.default_rng(2).uniform(SMALLEST_LEVEL, 1.0, (8, 60))
     site = SiteSignature(model)
     by_hop = [site.evidence(feature).sides.log_ratios for feature in features]
@@ -101,7 +101,7 @@ def test_along_a_stream_posteriors_are_those_of_the_running_model():
 
 
 @pytest.mark.slow
-def test_the_command_learns_streams_and_the_card_counts_their_classes(tmp_path):
+def test_the_card_counts_the_classes_of_learned_streams(tmp_path):
     rng = np.random.default_rng(5)
     both = stream(("light", "left", 30.0), ("light", "right", 30.5), ("light", "left", 50.0), rng=rng)
     both.save(tmp_path / "heard.npz")
@@ -124,7 +124,7 @@ def test_the_command_learns_streams_and_the_card_counts_their_classes(tmp_path):
     model = read_model(tmp_path / "m")
     assert model.signature.classes == WINDOW_CLASSES
     assert "180 direct" in model.provenance.classifier and " both" in model.provenance.classifier
-    # Policies are of the explanations: hidden on either side, in view, none.
+    # Policies of the hypotheses: hidden on either side, in view, none.
     assert len(model.policies.policies[0].reference_prior) == 4
     assert sum(model.policies.policies[0].reference_prior) == pytest.approx(1.0)
 
@@ -135,11 +135,11 @@ RING = MicrophoneArray(
 
 
 @pytest.mark.parametrize("azimuth_deg", [-60.0, 0.0, 45.0])
-def test_a_source_in_the_open_is_heard_where_it_is(azimuth_deg):
+def test_the_feature_of_a_source_in_the_open_peaks_at_its_azimuth(azimuth_deg):
     rng = np.random.default_rng(3)
     loud = OpenSource(np.radians(azimuth_deg), 12.0, (0.0, 0.0), snr_db=25.0)
     early, late = open_feature(RING, loud, rng).reshape(2, 30)
-    # Azimuths of the feature grow to the right.
+    # Azimuths of the feature increase to the right.
     there = np.linspace(-90.0, 90.0, 30)
     assert there[early.argmax()] == pytest.approx(-azimuth_deg, abs=8.0)
     assert there[late.argmax()] == pytest.approx(-azimuth_deg, abs=8.0)
@@ -147,7 +147,7 @@ def test_a_source_in_the_open_is_heard_where_it_is(azimuth_deg):
     assert np.ptp(lost) < 0.5 * np.ptp(early)
 
 
-def test_the_same_generator_gives_the_same_windows_in_the_open():
+def test_windows_in_the_open_are_reproducible():
     first, again = (open_field_features(RING, 3, np.random.default_rng(4)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(first, axis=0)) == 3

@@ -14,12 +14,7 @@ from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.sequence.sequence_model import (
-    COMING_S,
-    GROUPS,
-    SequenceAlarm,
-    SequencePosterior,
-)
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel

@@ -554,7 +554,7 @@ def test_trackevals_own_reader_takes_the_rows_as_tracks_and_as_truth(tmp_path):
     assert confidences == [[0.9], [], [0.9, 0.25]]
 
 
-def test_what_is_missing_is_named(log, tmp_path, monkeypatch, capsys):
+def test_missing_packages_and_libraries_raise_an_error(log, tmp_path, monkeypatch, capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     for options, said in (

@@ -1,4 +1,4 @@
-"""Work over processes: in order, with errors as they were raised, and nobody left behind."""
+"""Work in processes: order, errors and end of workers."""
 
 import os
 import pickle
@@ -15,13 +15,13 @@ from worldstate.ground.parallel import in_processes
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
-def test_results_come_in_the_order_of_the_items(jobs):
+def test_results_have_the_order_of_the_items(jobs):
     items = [-3, 1, 0, -2, 5]
     assert list(in_processes(abs, items, jobs)) == [3, 1, 0, 2, 5]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_of_the_work_arrives_as_it_was_raised(jobs):
+def test_errors_of_the_work_are_raised_unchanged(jobs):
     with pytest.raises(InputFileError, match=r"^missing\.json: ") as caught:
         list(in_processes(read_model, ["missing.json"] * 2, jobs))
     assert caught.value.path == "missing.json"
@@ -31,12 +31,12 @@ def test_an_error_of_the_work_arrives_as_it_was_raised(jobs):
     "error",
     [InputFileError("a.wav", "bad"), SchemaVersionError("a", "old"), MissingExtraError("cv2", "vision")],
 )
-def test_an_error_may_be_sent_to_another_process(error):
+def test_errors_can_be_pickled(error):
     sent = pickle.loads(pickle.dumps(error))
     assert (type(sent), str(sent), vars(sent)) == (type(error), str(error), vars(error))
 
 
-def test_the_end_of_a_worker_is_an_error():
+def test_the_death_of_a_worker_raises_an_error():
     with pytest.raises(WorldstateError, match="ended before its work was done"):
         list(in_processes(os._exit, [1, 1], 2))
 
@@ -47,7 +47,7 @@ from worldstate.ground.parallel import in_processes
 for _ in in_processes(time.sleep, [0.0, 0.0, 60.0, 60.0], 2): print("one", flush=True)
 """
 
-# Workers that do not hear SIGTERM, as one that gets it between two pieces of work may miss it.
+# Workers without SIGTERM, which may be missed between two pieces of work.
 DEAF = """
 import signal, time
 from functools import partial
@@ -59,7 +59,7 @@ for _ in in_processes(call, items, 2): print("one", flush=True)
 
 
 def alive(session):
-    """Return how many processes of a session still run."""
+    """Return the number of running processes of a session."""
     listed = subprocess.run(["ps", "-o", "pid=", "--sid", str(session)], capture_output=True, check=False)
     return len(listed.stdout.split())
 
@@ -69,7 +69,7 @@ def alive(session):
     [(signal.SIGTERM, SLEEPERS), (signal.SIGKILL, SLEEPERS), (signal.SIGKILL, DEAF)],
     ids=["SIGTERM", "SIGKILL", "deaf"],
 )
-def test_no_worker_outlives_the_process_that_started_it(number, script):
+def test_workers_end_with_the_process_that_started_them(number, script):
     command = [sys.executable, "-c", script]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True

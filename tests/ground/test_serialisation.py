@@ -1,4 +1,4 @@
-"""The one reader and writer of dataclasses."""
+"""Reading and writing of dataclasses."""
 
 import json
 import math
@@ -88,7 +88,7 @@ def written(**changes):
     return json.loads(json.dumps(encode(everything()), allow_nan=False)) | changes
 
 
-def test_every_kind_of_field_is_written_and_read_back():
+def test_every_kind_of_field_reads_back():
     again = decode(Everything, written(), "file")
     assert encode(again) == encode(everything())
     assert again.looks == (Bearing(0.1), NotUsable("dark"))
@@ -98,7 +98,7 @@ def test_every_kind_of_field_is_written_and_read_back():
     assert written()["low_m"] == 0.0
 
 
-def test_unknown_keys_are_ignored_and_what_was_added_later_may_be_missing():
+def test_unknown_keys_are_ignored_and_later_fields_may_be_missing():
     values = written(mood="fine")
     del values["gain"]
     assert decode(Everything, values, "file").gain == 2.0
@@ -131,13 +131,13 @@ def test_unknown_keys_are_ignored_and_what_was_added_later_may_be_missing():
         ("low_m", 2.0, r"file: low_m: expected at most high_m"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named_with_its_place(key, value, words):
+def test_errors_name_the_field(key, value, words):
     with pytest.raises(InvalidArgumentError, match=words):
         decode(Everything, written(**{key: value}), "file")
 
 
 @pytest.mark.parametrize("version", ["3.0.0", "1.9.0", "21.0.0", "9" * 5000, "x", 2, None])
-def test_another_major_version_is_refused_and_a_minor_one_read(version):
+def test_other_major_versions_raise_an_error_and_minor_ones_are_read(version):
     stamp = {"name": "test.Everything", "version": version}
     with pytest.raises(SchemaVersionError, match=r"expected schema test\.Everything 2\.x"):
         decode(Everything, written(schema=stamp), "file")
@@ -145,7 +145,7 @@ def test_another_major_version_is_refused_and_a_minor_one_read(version):
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False), st.integers(-(2**62), 2**62), st.text())
-def test_numbers_and_text_survive_to_the_bit(number, count, name):
+def test_numbers_and_text_read_back_exactly(number, count, name):
     text = json.dumps(encode(everything(number=number, count=count, name=name)))
     again = decode(Everything, json.loads(text), "file")
     assert (again.number, again.count, again.name) == (number, count, name)
@@ -158,7 +158,7 @@ junk = st.recursive(
 
 
 @given(st.sampled_from(sorted(written())), junk)
-def test_whatever_stands_in_a_field_is_read_or_refused_by_a_typed_error(key, value):
+def test_any_content_of_a_field_is_read_or_raises_a_typed_error(key, value):
     try:
         decode(Everything, written(**{key: value}), "file")
     except WorldstateError as error:
@@ -166,7 +166,7 @@ def test_whatever_stands_in_a_field_is_read_or_refused_by_a_typed_error(key, val
 
 
 @given(*2 * [st.text(st.characters(exclude_categories=()), max_size=4)])
-def test_json_text_can_be_written_again_or_is_refused(key, value):
+def test_json_text_can_be_written_again_or_raises_an_error(key, value):
     """Of any code point, halves of surrogate pairs among them, which JSON escapes as \\ud800."""
     text = json.dumps({key: [value]})
     halves = "|".join((key, value)).encode("utf-16", "surrogatepass")
@@ -192,7 +192,7 @@ JSON = st.recursive(
 
 
 @given(items=st.lists(JSON, max_size=9), indent=st.sampled_from([None, 0, 2]), long=st.integers(0, 3))
-def test_a_list_that_is_read_item_by_item_is_what_it_is_as_a_whole(items, indent, long):
+def test_a_list_read_by_items_equals_the_whole_list(items, indent, long):
     items += ["a" * 20_000, list(range(9000)), {"b": [{}] * 3000}][:long]
     found, text = [], "{" + json.dumps("a") + ":" + json.dumps(items, indent=indent) + "}"
     assert decode_items(text, text.index("["), found.append, "items") == len(text) - 1
@@ -204,14 +204,14 @@ def test_a_list_that_is_read_item_by_item_is_what_it_is_as_a_whole(items, indent
 
 @pytest.mark.parametrize("depth", [700, 20_000])
 @pytest.mark.parametrize("item", ["[" * 5, '"\\ud800"', "NaN", "{]", "[1 2]", "1,,2", "1 2", "[[0]], x"])
-def test_an_item_that_is_no_json_is_refused(item, depth):
+def test_an_item_that_is_no_json_raises_an_error(item, depth):
     text = "[" + item.replace("[" * 5, "[" * depth + "]" * depth + ", x") + "]"
     with pytest.raises(InvalidArgumentError, match=r"^items \d: expected JSON"):
         decode_items(text, 0, [].append, "items")
 
 
 @pytest.mark.parametrize("depth", [300, 700, 20_000])
-def test_lists_in_lists_are_refused_however_deep(depth):
+def test_nested_lists_raise_an_error_at_any_depth(depth):
     deep = 1.0
     for _ in range(depth):
         deep = [deep]
@@ -219,5 +219,5 @@ def test_lists_in_lists_are_refused_however_deep(depth):
         decode(FloatArray, deep, "weights")
 
 
-def test_an_escaped_backslash_is_no_half_of_a_pair():
+def test_an_escaped_backslash_is_no_surrogate():
     assert decode_json(r'["C:\\ud800", "\ud83d\ude97"]', "car") == ["C:\\ud800", "\N{AUTOMOBILE}"]

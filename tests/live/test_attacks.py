@@ -1,4 +1,4 @@
-"""Attacks on a whole run, from other processes: what a stranger may not take away or bring in."""
+"""Attacks on a run by other processes."""
 
 import io
 import json
@@ -28,7 +28,7 @@ from worldstate.frontend.array.microphone_array import ovad_array
 
 RATE, SECRET = 8_000, b"sixteen bytes or more"
 LOOK = {"boxes": [], "scores": [], "classes_str": [], "age_s": 0.02}
-# As many datagrams a second as are asked for, in bursts of a hundredth of it.
+# The requested number of datagrams per second, in bursts of 0.01 s.
 FLOOD = """
 import socket, sys, time
 port, rate, size = map(int, sys.argv[1:])
@@ -49,7 +49,7 @@ def free_port() -> int:
 
 @contextmanager
 def looking(port: int, keyed: bool):
-    """Send a look ten times a second from a detector of one's own, signed if there is a key."""
+    """Send a look 10 times per second, signed if there is a key."""
     ended = threading.Event()
 
     def look() -> None:
@@ -68,7 +68,7 @@ def looking(port: int, keyed: bool):
 
 
 def fresh_looks(street, folder, seconds: float, keyed: bool, *flood: int) -> float:
-    """Return in which share of the hops after the first two seconds a look was fresh."""
+    """Return the share of hops after 2 s with a fresh look."""
     port, folder = free_port(), folder / "-".join(map(str, (0, *flood)))
     folder.mkdir()
     play = "--play", "street.wav", "--array", "mics.csv", "--uncalibrated", "--duration", str(seconds)
@@ -102,14 +102,14 @@ def fresh_looks(street, folder, seconds: float, keyed: bool, *flood: int) -> flo
 
 
 def crowded(boxes: int, seed: int) -> DetectionFrame:
-    """Return an image full of cars, which stand elsewhere in each."""
+    """Return an image full of cars at random places."""
     rng = np.random.default_rng(seed)
     left, top = rng.uniform(0.0, 1800.0, boxes), rng.uniform(0.0, 500.0, boxes)
     places = np.stack([left, top, left + 100.0, top + 150.0], axis=1)
     return DetectionFrame(places, rng.uniform(0.76, 1.0, boxes), ("car",) * boxes)
 
 
-def test_of_a_crowded_image_the_highest_scores_are_kept_and_what_does_not_count_goes_first():
+def test_a_crowded_image_keeps_the_highest_scores():
     crowd = crowded(200, seed=0)
     labels = ("person",) * 100 + crowd.labels[100:]
     mixed = replace(crowd, labels=labels, scores=np.where(np.arange(200) < 100, 1.0, crowd.scores))
@@ -123,7 +123,7 @@ def test_of_a_crowded_image_the_highest_scores_are_kept_and_what_does_not_count_
 
 
 def hop_cost_s(boxes: int, path: str, folder: Path) -> float:
-    """Return the processor time of a hop of 56 microphones with so many boxes an image, reading included."""
+    """Return processor time per hop of 56 microphones with this number of boxes per image."""
     noise = np.random.default_rng(0).uniform(-0.01, 0.01, (4_800, 56)).astype(np.float32)
     frames, costs, camera = [crowded(boxes, hop) for hop in range(40)], list[float](), PinholeCamera.ovad()
     told = [
@@ -161,7 +161,7 @@ def hop_cost_s(boxes: int, path: str, folder: Path) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["python", "datagram", "signed", "file"])
-def test_a_thousand_boxes_an_image_cost_what_sixty_four_do(path, tmp_path):
+def test_a_thousand_boxes_cost_no_more_than_64(path, tmp_path):
     few, many = (min(hop_cost_s(boxes, path, tmp_path) for _ in range(3)) for boxes in (64, 1_000))
     print(f"{path}: {1e3 * few:.1f} ms, {1e3 * many:.1f} ms, {many / few:.3f}")
     assert many <= 1.2 * few
@@ -170,7 +170,7 @@ def test_a_thousand_boxes_an_image_cost_what_sixty_four_do(path, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [7, 1_000])
 @pytest.mark.parametrize("keyed", [True, False])
-def test_a_flood_takes_at_most_a_tenth_of_the_looks(street, tmp_path, size, keyed):
+def test_a_flood_costs_at_most_a_tenth_of_the_looks(street, tmp_path, size, keyed):
     without = fresh_looks(street, tmp_path, 8.0, keyed)
     under = fresh_looks(street, tmp_path, 8.0, keyed, 5_000, size)
     print(f"keyed {keyed}, {size} bytes: {without:.3f} without, {under:.3f} under the flood")

@@ -1,4 +1,4 @@
-"""The channel between a sensor's thread and the one that computes."""
+"""The channel between the thread of a sensor and that of the computation."""
 
 import threading
 import time
@@ -10,12 +10,12 @@ import pytest
 
 from worldstate.adapters.live.live_sensors import image_channel
 from worldstate.adapters.live.live_sound import BoundedChannel
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.errors import InputFileError
 
 DAY_IMAGES = 24 * 3600 * 10
 
 
-def test_the_oldest_makes_room_and_is_counted():
+def test_the_oldest_item_is_dropped_and_counted():
     channel = BoundedChannel[int](3)
     for number in range(10):
         channel.put(number)
@@ -23,7 +23,7 @@ def test_the_oldest_makes_room_and_is_counted():
     assert channel.dropped == 7
 
 
-def test_what_waits_is_given_before_the_end_and_before_the_error():
+def test_queued_items_precede_end_and_error():
     channel = BoundedChannel[int](3)
     channel.put(1)
     channel.close(InputFileError("device", "unplugged"))
@@ -34,7 +34,7 @@ def test_what_waits_is_given_before_the_end_and_before_the_error():
         channel.take_all()
 
 
-def test_a_source_that_does_not_notice_the_end_cannot_put_it_off():
+def test_items_after_the_end_are_ignored():
     channel = BoundedChannel[int](3)
     channel.put(1)
     channel.close()
@@ -43,7 +43,7 @@ def test_a_source_that_does_not_notice_the_end_cannot_put_it_off():
     assert channel.dropped == 0
 
 
-def test_whoever_waits_is_woken_by_an_item_and_by_the_end():
+def test_items_and_the_end_wake_a_waiting_thread():
     channel = BoundedChannel[int](2)
     taken = []
     waiting = threading.Thread(target=lambda: taken.extend([channel.take(), channel.take()]))
@@ -54,13 +54,8 @@ def test_whoever_waits_is_woken_by_an_item_and_by_the_end():
     assert taken == [5, None]
 
 
-def test_a_capacity_is_a_number_of_items():
-    with pytest.raises(InvalidArgumentError, match="capacity"):
-        BoundedChannel(0)
-
-
 def pushed(count: int, taken_every: int) -> int:
-    """Push so many images through, all at once; return the bytes held at the end."""
+    """Push `count` images at once; return the bytes held at the end."""
     images, seen = image_channel(), 0
     tracemalloc.start()
     try:
@@ -76,7 +71,7 @@ def pushed(count: int, taken_every: int) -> int:
     return held
 
 
-def test_images_that_nobody_takes_use_no_memory():
+def test_unread_images_use_no_memory():
     assert abs(pushed(4_000, 100) - pushed(400, 100)) < 1 << 15
 
 

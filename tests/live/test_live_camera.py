@@ -1,4 +1,4 @@
-"""A camera and a detector that run, as the channel that is asked for co-evidence."""
+"""A live camera and detector as the channel of co-evidence."""
 
 import json
 import resource
@@ -19,7 +19,7 @@ from worldstate.adapters.live.live_sound import BoundedChannel, LiveSound
 from worldstate.adapters.own_parts import OwnDetector
 from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.array.microphone_array import ovad_array
-from worldstate.ground.errors import InputFileError, InvalidArgumentError, OwnPartError
+from worldstate.ground.errors import InputFileError, OwnPartError
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 
@@ -51,8 +51,8 @@ def source() -> Source:
     return open_source(LiveSound(Silent()), array=ovad_array(), camera=CAMERA, settings=ListenSettings())
 
 
-def test_it_answers_as_the_camera_of_a_recording(source):
-    # A car that crosses the image, stops, and is gone.
+def test_a_live_camera_equals_that_of_a_recording(source):
+    # A car that crosses the image, stops and disappears.
     places = [None] * 10 + [30.0 * n for n in range(10)] + [300.0] * 15 + [None] * 5
     frames = [EMPTY if place is None else box(place) for place in places]
     log = DetectionLog.at_rate(frames, 10.0)
@@ -68,7 +68,7 @@ def test_it_answers_as_the_camera_of_a_recording(source):
 
 
 @pytest.mark.parametrize("rate_hz", [60, 100, 400])
-def test_a_fast_camera_finds_a_parked_car_parked_as_well(source, rate_hz):
+def test_a_parked_car_is_static_at_any_frame_rate(source, rate_hz):
     camera = replace(source, detections=NO_LOOKS).camera_channel()
     for number in range(2 * rate_hz):
         camera.see(nanoseconds(number / rate_hz), box(300.0))
@@ -85,7 +85,7 @@ def test_a_fast_camera_finds_a_parked_car_parked_as_well(source, rate_hz):
         ((400.0, 100.0, 300.0, 300.0), 0.9),
     ],
 )
-def test_boxes_that_cannot_be_are_refused_and_the_run_goes_on(source, places, score):
+def test_wrong_boxes_are_counted_and_the_run_continues(source, places, score):
     class Broken:
         def detect(self, image):
             return DetectionFrame(np.array([places]), np.array([score]), ("car",))
@@ -96,18 +96,18 @@ def test_boxes_that_cannot_be_are_refused_and_the_run_goes_on(source, places, sc
     assert camera.sightings(stamp(10)) == ()
 
 
-def test_without_an_image_it_was_not_asked(source):
+def test_without_an_image_the_camera_is_unqueried(source):
     camera = replace(source, detections=NO_LOOKS).camera_channel()
     assert isinstance(camera.ask(0, AHEAD), Unqueried)
     camera.see(0, EMPTY)
     assert isinstance(camera.ask(stamp(1), AHEAD), Absent)
-    # The camera hangs: its last image is no look at what is there now.
+    # The camera hangs, so its last image is no current look.
     assert isinstance(camera.ask(stamp(5), AHEAD), Unqueried)
     camera.see(stamp(5), box(260.0))
     assert isinstance(camera.ask(stamp(5), AHEAD), Present)
 
 
-def test_looks_out_of_order_are_left_out(source):
+def test_looks_out_of_order_are_dropped(source):
     camera = source.camera_channel()
     for look in ((stamp(5), EMPTY), (stamp(3), box(260.0)), (stamp(5), box(260.0))):
         camera.see(*look)
@@ -115,7 +115,7 @@ def test_looks_out_of_order_are_left_out(source):
 
 
 class Counting:
-    """A detector that finds one box, and knows how many images it saw."""
+    """A detector that finds one box and counts its images."""
 
     def __init__(self) -> None:
         self.seen = 0
@@ -126,7 +126,7 @@ class Counting:
 
 
 def camera_day(source: Source, hops: int) -> tuple[VisionQuery, int, int]:
-    """Let three images pass at every hop, and ask at every tenth."""
+    """Pass three images per hop and query at every tenth hop."""
     images, detector = image_channel(), Counting()
     looks = ImageLooks(images, detector, nanoseconds, (640, 480))
     camera = source.camera_channel()
@@ -140,7 +140,7 @@ def camera_day(source: Source, hops: int) -> tuple[VisionQuery, int, int]:
     return camera, detector.seen, images.dropped
 
 
-def test_it_remembers_no_more_than_it_needs(source):
+def test_the_camera_keeps_a_bounded_memory(source):
     camera, seen, dropped = camera_day(source, 300)
     assert seen == 30 * 4
     assert seen + dropped == 900
@@ -148,7 +148,7 @@ def test_it_remembers_no_more_than_it_needs(source):
     assert len(camera.detections.frames) == REMEMBERED
 
 
-def test_images_of_another_camera_are_refused(source):
+def test_images_of_another_size_are_dropped(source):
     images = image_channel()
     for height, width in ((720, 1280), (480, 640)):
         images.put((0.0, np.zeros((height, width, 3), np.uint8)))
@@ -157,7 +157,7 @@ def test_images_of_another_camera_are_refused(source):
     assert "expected images of the lens's 640 x 480 px, got 1280 x 720" in looks.problem
 
 
-def test_a_box_outside_the_image_is_refused_and_the_next_one_counts(source):
+def test_a_box_outside_the_image_costs_only_its_look(source):
     camera = replace(source, detections=NO_LOOKS).camera_channel()
     detections = DetectionSocket("127.0.0.1:0", lambda at_s: stamp(1))
     outside, inside = (
@@ -183,7 +183,7 @@ def sent(
     return looks
 
 
-def test_detections_come_as_datagrams_with_their_age(source):
+def test_datagrams_carry_detections_with_their_age(source):
     now_ns = time.monotonic_ns()
     one = {"boxes": [[260, 100, 380, 300]], "scores": [0.9], "classes_str": ["car"], "age_s": 2.0}
     none = {"boxes": [], "scores": [], "classes_str": []}
@@ -194,7 +194,7 @@ def test_detections_come_as_datagrams_with_their_age(source):
     assert looks[1][0] > now_ns
 
 
-def test_datagrams_that_cannot_be_read_are_counted_and_named():
+def test_unreadable_datagrams_are_counted_and_reported():
     wrong = [b"\xff", b"[]", b'{"boxes": [[1, 2, 3, 4]], "scores": [], "classes_str": []}']
     detections = DetectionSocket("127.0.0.1:0", nanoseconds)
     assert sent(detections, *wrong) == []
@@ -202,14 +202,8 @@ def test_datagrams_that_cannot_be_read_are_counted_and_named():
     assert "1 boxes, 0 scores" in detections.problem
 
 
-@pytest.mark.parametrize("address", ["9100", "127.0.0.1:x", "127.0.0.1:70000"])
-def test_an_address_is_a_host_and_a_port(address):
-    with pytest.raises(InvalidArgumentError, match="expected HOST:PORT"):
-        DetectionSocket(address, nanoseconds)
-
-
 class Odd:
-    """A detector that does something else at each image."""
+    """A detector with a different fault per image."""
 
     def __init__(self) -> None:
         self._given = iter([None, RuntimeError("no memory on the card"), 7, KeyError("boxes"), box(260.0)])
@@ -222,14 +216,14 @@ class Odd:
 
 
 @pytest.mark.parametrize("own", [Odd, lambda: OwnDetector("mine", Odd())])
-def test_a_callback_that_fails_or_gives_none_costs_its_image(source, own):
+def test_a_failing_callback_costs_only_its_image(source, own):
     camera, images = replace(source, detections=NO_LOOKS).camera_channel(), image_channel()
     looks, problems = ImageLooks(images, own(), nanoseconds, (640, 480)), []
     for number, image in enumerate([None, np.zeros(4), *[np.zeros((480, 640, 3), np.uint8)] * 5]):
         images.put((0.1 * number, image))
         try:
             looks.deliver(camera.see)
-        except OwnPartError as error:  # a part of an installed package ends the run with its name
+        except OwnPartError as error:  # an error in a user's detector ends the run with its name
             problems.append(str(error))
             continue
         problems.append(looks.problem)
@@ -250,7 +244,7 @@ NO_IMAGES = (
 
 
 @pytest.mark.parametrize("given", NO_IMAGES, ids=range(len(NO_IMAGES)))
-def test_what_is_no_image_costs_itself(source, given):
+def test_wrong_images_cost_only_themselves(source, given):
     camera, images = replace(source, detections=NO_LOOKS).camera_channel(), image_channel()
     looks = ImageLooks(images, Counting(), nanoseconds, (640, 480))
     for one in (given, (0.2, IMAGE)):
@@ -259,7 +253,7 @@ def test_what_is_no_image_costs_itself(source, given):
     assert camera.last_look(nanoseconds(0.2)) is not None
 
 
-def test_a_camera_that_ends_with_an_error_counts_once(source):
+def test_the_error_of_a_camera_is_counted_once(source):
     images = image_channel()
     looks = ImageLooks(images, Counting(), nanoseconds, (640, 480))
     images.close(OSError("unplugged"))
@@ -268,7 +262,7 @@ def test_a_camera_that_ends_with_an_error_counts_once(source):
 
 
 class Capture:
-    """What is used of OpenCV's VideoCapture: three images, then the plug is pulled."""
+    """Stand-in for VideoCapture of OpenCV that stops after three images."""
 
     def __init__(self, device: int) -> None:
         self._left = 3 if device == 0 else 0
@@ -293,7 +287,7 @@ def cameras(monkeypatch):
     )
 
 
-def test_a_camera_gives_its_images_and_may_give_no_more(cameras):
+def test_a_camera_that_stops_gives_its_images_first(cameras):
     images, taken = image_channel(), []
     with CameraFeed(0, images), pytest.raises(TimeoutError):
         while (image := images.take(1.0)) is not None:
@@ -304,19 +298,19 @@ def test_a_camera_gives_its_images_and_may_give_no_more(cameras):
     assert 0.0 < time.monotonic() - stamps_s[0] < 5.0
 
 
-def test_a_camera_that_is_not_there(cameras):
+def test_a_missing_camera_raises_an_error(cameras):
     with pytest.raises(InputFileError, match=r"camera 7: .* cannot be opened"):
         CameraFeed(7, image_channel())
 
 
 @pytest.mark.slow
-def test_a_day_of_looks_uses_no_memory(source):
+def test_a_day_of_looks_needs_no_more_memory(source):
     def largest_kb() -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
     camera_day(source, 600)
     before = largest_kb()
-    # A day of ten images a second, three at every hop of the loop.
+    # A day of ten images per second, three per hop of the loop.
     hops = 24 * 3600 * 10 // 3
     camera, seen, dropped = camera_day(source, hops)
     assert seen + dropped == 3 * hops

@@ -1,4 +1,4 @@
-"""`worldstate live` on a recording that is played."""
+"""`worldstate live` on a played recording."""
 
 import io
 import json
@@ -37,7 +37,7 @@ def command(street, *more):
     return ["live", *play, *map(str, more)]
 
 
-def test_states_are_those_of_run_and_no_sound_is_kept(street, tmp_path, capsys):
+def test_live_has_the_states_of_run_and_keeps_no_sound(street, tmp_path, capsys):
     live, run = tmp_path / "live" / "states.jsonl", tmp_path / "run.jsonl"
     live.parent.mkdir()
     assert main(command(street, "--speed", 4, "--out", live, "--json")) == 0
@@ -52,7 +52,7 @@ def test_states_are_those_of_run_and_no_sound_is_kept(street, tmp_path, capsys):
     assert report["cpu_s"] > 0.0
 
 
-def test_sound_is_kept_where_asked_for(street, tmp_path):
+def test_sound_is_kept_on_request(street, tmp_path):
     kept = tmp_path / "kept.wav"
     assert main(command(street, "--speed", 20, "--keep-sound", kept)) == 0
     heard, rate_hz = soundfile.read(kept)
@@ -60,12 +60,12 @@ def test_sound_is_kept_where_asked_for(street, tmp_path):
     np.testing.assert_array_equal(heard, soundfile.read(street / "street.wav")[0])
 
 
-def test_kept_sound_never_replaces_what_is_played(street, capsys):
+def test_kept_sound_does_not_replace_its_source(street, capsys):
     assert main(command(street, "--keep-sound", street / "street.wav")) == 2
     assert "this one is an input" in capsys.readouterr().err
 
 
-def test_losses_are_said_when_they_happen(street, capsys, monkeypatch):
+def test_losses_are_reported_when_they_happen(street, capsys, monkeypatch):
     slow = "worldstate.cli.common.live_view.view_of"
     monkeypatch.setattr(slow, lambda live: time.sleep(0.05) or view_of(live))
     assert main(command(street, "--speed", 100, "--duration", 8, "--view", "--json")) == 0
@@ -91,13 +91,13 @@ def test_the_view_shows_bearing_risk_and_losses(street):
 
 
 @pytest.mark.long
-def test_a_signal_ends_the_run_and_what_it_wrote_is_complete(street, tmp_path):
+def test_a_signal_ends_the_run_with_complete_files(street, tmp_path):
     out = tmp_path / "states.jsonl"
     words = command(street, "--duration", 60, "--out", out, "--json")
     script = [sys.executable, "-m", "worldstate", *words]
     with subprocess.Popen(script, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ) as process:
         until_s = time.monotonic() + 60.0
-        # The file has its name only at the end: a temporary one stands beside it until states are written.
+        # The file has its name only at the end, so wait for content in the temporary one beside it.
         while not any(one.stat().st_size for one in tmp_path.iterdir()) and time.monotonic() < until_s:
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
@@ -133,7 +133,7 @@ def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch)
 
 
 class Capture:
-    """What is used of OpenCV's VideoCapture: images of a grey wall, ten a second."""
+    """Stand-in for VideoCapture of OpenCV: a grey wall at 10 Hz."""
 
     def __init__(self, device: int) -> None:
         self._opened = True
@@ -154,7 +154,7 @@ def looked_at(states):
     return [view["sensor"] for snapshot in snapshots for view in snapshot["searched"]]
 
 
-def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys):
+def test_a_local_camera_is_queried(street, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         "worldstate.adapters.live.live_sensors.optional", lambda module: SimpleNamespace(VideoCapture=Capture)
     )
@@ -163,7 +163,7 @@ def test_a_camera_of_the_machine_is_asked(street, tmp_path, monkeypatch, capsys)
     lens.write_text(json.dumps(camera))
     asked = "--camera-device", 0, "--camera", lens, "--out", states, "--json"
     assert main(command(street, *asked)) == 0
-    # Every image is looked at before the next block of sound is taken.
+    # Every image is processed before the next block of sound.
     assert json.loads(capsys.readouterr().out)["images_dropped"] < 15
     assert "camera" in looked_at(states)
 
@@ -176,7 +176,7 @@ def free_port() -> int:
 
 @contextmanager
 def sending(port: int, *datagrams: bytes):
-    """Send these again and again while the block runs."""
+    """Send these datagrams repeatedly while the block runs."""
     stopped = threading.Event()
 
     def send():
@@ -194,7 +194,7 @@ def sending(port: int, *datagrams: bytes):
         thread.join()
 
 
-def test_a_detector_of_ones_own_is_asked(street, tmp_path, capsys):
+def test_a_separate_detector_is_queried(street, tmp_path, capsys):
     states, port = tmp_path / "states.jsonl", free_port()
     empty = json.dumps({"boxes": [], "scores": [], "classes_str": [], "age_s": 0.02}).encode()
     with sending(port, empty, b"nonsense"):
@@ -206,7 +206,7 @@ def test_a_detector_of_ones_own_is_asked(street, tmp_path, capsys):
     assert "camera" in looked_at(states)
 
 
-def test_several_cameras_are_asked_and_a_box_outside_an_image_is_refused(street, tmp_path, capsys):
+def test_several_cameras_are_queried(street, tmp_path, capsys):
     lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
     cameras = [{"name": name, **lens, "yaw_deg": yaw} for name, yaw in (("front", 0.0), ("aside", 60.0))]
     car, states = tmp_path / "car.json", tmp_path / "states.jsonl"
@@ -229,7 +229,7 @@ def test_several_cameras_are_asked_and_a_box_outside_an_image_is_refused(street,
 
 
 @pytest.mark.parametrize("command_name", ["live", "run"])
-def test_odometry_chooses_the_model_of_a_moving_ego_and_says_so(street, tmp_path, caplog, command_name):
+def test_odometry_selects_the_model_of_a_moving_ego(street, tmp_path, caplog, command_name):
     positions_m = np.loadtxt(street / "mics.csv", delimiter=",").tolist()
     (tmp_path / "odometry.csv").write_text("time_s,speed_mps\n0,4\n")
     play = ["--speed", "20", "--play"] if command_name == "live" else []
@@ -244,7 +244,7 @@ def test_odometry_chooses_the_model_of_a_moving_ego_and_says_so(street, tmp_path
         assert last["context"]["ego_speed_mps"] == (4.0 if moves else None)
 
 
-def test_odometry_that_is_told_moves_the_ego(street, tmp_path, capsys):
+def test_datagrams_of_odometry_move_the_ego(street, tmp_path, capsys):
     states, port = tmp_path / "states.jsonl", free_port()
     driving = json.dumps({"speed_mps": 5.0, "yaw_rate_rad_s": 0.1, "age_s": 0.01}).encode()
     with sending(port, driving, b'{"speed_mps": 900}', b'{"speed_mps": 1, "x_m": 3}'):
@@ -258,8 +258,8 @@ def test_odometry_that_is_told_moves_the_ego(street, tmp_path, capsys):
     assert ego["position_m"][0] > 1.0
 
 
-def test_what_was_saved_is_gone_on_from(street, tmp_path):
-    """Live and `run` take the same options and give the same states, and the clock goes on."""
+def test_live_resumes_from_a_checkpoint_as_run_does(street, tmp_path):
+    """Both commands have the same options and states, and the clock continues."""
     saved = {}
     for name in ("live", "run"):
         state, half, rest = (tmp_path / f"{name}{end}" for end in (".json", "1.jsonl", "2.jsonl"))

@@ -1,4 +1,4 @@
-"""Logs of a run that does not end: under their own name, and readable whatever ends it."""
+"""Logs of a run without end: their names, and readability after any end."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def last_s(path):
 
 
 def killed(street, folder, after_states, wait_s):
-    """Kill a run some time after it has written so many states; return when the last one was."""
+    """Kill a run `wait_s` after its state number `after_states`; return the time of the last state."""
     speed = 3 if after_states < 100 else 30
     endless = words(street, folder, "--duration", 86_400, "--speed", speed)
     script = [sys.executable, "-m", "worldstate", *endless]
@@ -77,22 +77,22 @@ def check_killed(street, folder, seed, hops=(15, 60)):
 
 
 @pytest.mark.long
-def test_a_killed_run_leaves_what_it_wrote(street, tmp_path):
+def test_a_killed_run_leaves_readable_files(street, tmp_path):
     for seed in (1, 2):
         check_killed(street, tmp_path / str(seed), seed)
 
 
 @pytest.mark.slow
-def test_a_run_killed_at_twenty_moments_leaves_what_it_wrote(street, tmp_path):
+def test_a_run_killed_at_twenty_times_leaves_readable_files(street, tmp_path):
     for seed in range(20):
-        # Every fourth after its belief was saved, once or twice.
+        # Every fourth run is killed after its belief was saved once or twice.
         check_killed(street, tmp_path / str(seed), seed, (15, 60) if seed % 4 else (650, 1300))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", NAMES[:3])
-def test_a_full_disk_is_a_notice_and_what_was_written_reads(street, tmp_path, name):
-    # A file may not grow above this, which the kernel says as it says that a disk is full.
+def test_a_full_disk_gives_a_notice_and_readable_files(street, tmp_path, name):
+    # A limit of the file size, which the kernel reports as it reports a full disk.
     room = {"states.jsonl": 60_000, "states.mcap": 40_000, "kept.wav": 200_000}
     alone = {"states.jsonl": "--out", "states.mcap": "--export", "kept.wav": "--keep-sound"}[name]
     target = f"mcap={tmp_path / name}" if name == "states.mcap" else str(tmp_path / name)
@@ -123,7 +123,7 @@ def test_a_full_disk_is_a_notice_and_what_was_written_reads(street, tmp_path, na
         assert 1.0 < last_s(tmp_path / name) < 58.0
 
 
-def test_the_belief_is_kept_every_minute_and_at_an_error(street, tmp_path, monkeypatch):
+def test_the_belief_is_saved_every_minute_and_at_an_error(street, tmp_path, monkeypatch):
     belief = tmp_path / "belief.json"
     monkeypatch.setattr(live, "SAVED_EVERY_NS", 500_000_000)
     seen = []
@@ -141,7 +141,7 @@ def test_the_belief_is_kept_every_minute_and_at_an_error(street, tmp_path, monke
     assert read_checkpoint(belief).world.stamp_ns >= 1_500_000_000
 
 
-def test_a_log_that_is_full_goes_on_in_a_new_file(tmp_path):
+def test_a_full_log_continues_in_a_new_file(tmp_path):
     path = tmp_path / "log.jsonl"
     with line_writer(path, partial(GrowingFile, most_bytes=100)) as write:
         for number in range(60):
@@ -152,16 +152,7 @@ def test_a_log_that_is_full_goes_on_in_a_new_file(tmp_path):
     assert [json.loads(line)["number"] for line in lines] == list(range(60 - len(lines), 60))
 
 
-def test_a_log_that_was_there_is_kept(tmp_path):
-    path = tmp_path / "log.jsonl"
-    path.write_text("of the run before\n")
-    with GrowingFile(path) as log:
-        log.write(b"now\n")
-    assert (tmp_path / "log.1.jsonl").read_text() == "of the run before\n"
-    assert path.read_text() == "now\n"
-
-
-def test_what_is_written_once_there_is_room_again_follows_the_last_whole_record(tmp_path, caplog):
+def test_records_after_a_full_disk_follow_the_last_whole_one(tmp_path, caplog):
     unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
     with line_writer(path := tmp_path / "log.jsonl", GrowingFile) as write:
         write("first")
@@ -178,7 +169,7 @@ def test_what_is_written_once_there_is_room_again_follows_the_last_whole_record(
 
 
 @pytest.mark.parametrize("removal", [Path.unlink, lambda path: path.rename(path.with_name("taken.jsonl"))])
-def test_a_log_that_is_removed_is_a_notice_and_begins_anew(tmp_path, caplog, removal):
+def test_a_removed_log_gives_a_notice_and_restarts(tmp_path, caplog, removal):
     path = tmp_path / "log.jsonl"
     with line_writer(path, GrowingFile) as write:
         for round_ in range(3):
@@ -192,7 +183,7 @@ def test_a_log_that_is_removed_is_a_notice_and_begins_anew(tmp_path, caplog, rem
     assert not (tmp_path / "log.1.jsonl").exists()
 
 
-def test_an_mcap_that_is_removed_begins_anew_and_reads(tmp_path, caplog):
+def test_a_removed_mcap_restarts(tmp_path, caplog):
     path, states = tmp_path / "a.mcap", [WorldState(0, number * 100_000_000) for number in range(60)]
     with mcap_file(path, GrowingFile) as write:
         for number, state in enumerate(states):
@@ -205,7 +196,7 @@ def test_an_mcap_that_is_removed_begins_anew_and_reads(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("name", ["trace.osi", "trace.mcap"])
-def test_a_trace_that_is_removed_is_a_notice(tmp_path, caplog, name):
+def test_a_removed_trace_gives_a_notice(tmp_path, caplog, name):
     pytest.importorskip("osi3")
     state = scripted_states()[-1]
     with osi_trace(tmp_path / name, 9.0, GrowingFile) as write:
@@ -218,7 +209,7 @@ def test_a_trace_that_is_removed_is_a_notice(tmp_path, caplog, name):
 
 @pytest.mark.parametrize("name", ["rosbag", "rosbag-sqlite3"])
 @pytest.mark.parametrize("at_ns", [1_500_000_000, 2_000_000_000])
-def test_a_bag_that_is_removed_ends_no_run(street, tmp_path, monkeypatch, caplog, name, at_ns):
+def test_a_removed_bag_does_not_end_the_run(street, tmp_path, monkeypatch, caplog, name, at_ns):
     def show(step):
         if step.step.state.stamp_ns == at_ns:
             shutil.rmtree(next(tmp_path.glob(".bag*")))
@@ -234,7 +225,7 @@ def test_a_bag_that_is_removed_ends_no_run(street, tmp_path, monkeypatch, caplog
     assert not (tmp_path / "bag").exists()
 
 
-def test_a_folder_that_is_removed_ends_no_run(tmp_path, caplog):
+def test_a_removed_folder_does_not_end_the_run(tmp_path, caplog):
     (folder := tmp_path / "logs").mkdir()
     with line_writer(folder / "log.jsonl", GrowingFile) as write:
         write("one")
@@ -247,7 +238,7 @@ def test_a_folder_that_is_removed_ends_no_run(tmp_path, caplog):
     assert len(caplog.records) == 3
 
 
-def test_another_run_with_the_same_log_is_refused_and_takes_nothing(tmp_path):
+def test_a_second_run_with_the_same_log_raises_an_error(tmp_path):
     path = tmp_path / "log.jsonl"
     with line_writer(path, GrowingFile) as write:
         for lines in range(3):
@@ -259,7 +250,7 @@ def test_another_run_with_the_same_log_is_refused_and_takes_nothing(tmp_path):
 
 
 @pytest.mark.long
-def test_of_two_starts_at_once_one_writes_every_state(street, tmp_path):
+def test_one_of_two_simultaneous_runs_writes_every_state(street, tmp_path):
     command = [*words(street, tmp_path)[:8], "--duration", "6", "--speed", "3"]
     script = [sys.executable, "-m", "worldstate", *command]
     pair = [subprocess.Popen(script, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) for _ in range(2)]
@@ -269,14 +260,14 @@ def test_of_two_starts_at_once_one_writes_every_state(street, tmp_path):
     assert len((tmp_path / "states.jsonl").read_text().splitlines()) == 51
 
 
-def test_no_file_of_others_is_written_over(tmp_path):
+def test_files_of_others_are_not_overwritten(tmp_path):
     path = tmp_path / "log.jsonl"
     (tmp_path / "log.1.jsonl").write_text("of the user")
     path.write_text("of the run before")
     with line_writer(path, partial(GrowingFile, most_bytes=100)) as write:
         for number in range(40):
             write(f"{number:>10}")
-        # A user takes the file that was full, and puts another one in its place.
+        # A user moves the full file and puts another one in its place.
         (tmp_path / "log.3.jsonl").rename(tmp_path / "mine.jsonl")
         (tmp_path / "log.3.jsonl").write_text("mine, too")
         for number in range(40):
@@ -288,7 +279,7 @@ def test_no_file_of_others_is_written_over(tmp_path):
     assert held["log.3.jsonl"] == "mine, too"
 
 
-def test_kept_sound_that_is_removed_is_a_notice(tmp_path, caplog):
+def test_removed_sound_gives_a_notice(tmp_path, caplog):
     path, block = tmp_path / "kept.wav", np.zeros((800, 2), np.float32)
     path.write_bytes(b"of the run before")
     with kept_sound(path, RATE, 2) as keep:
@@ -302,7 +293,7 @@ def test_kept_sound_that_is_removed_is_a_notice(tmp_path, caplog):
     assert (tmp_path / "kept.1.wav").read_bytes() == b"of the run before"
 
 
-def test_a_full_mcap_goes_on_in_a_new_file(street, tmp_path, monkeypatch):
+def test_a_full_mcap_continues_in_a_new_file(street, tmp_path, monkeypatch):
     monkeypatch.setattr("worldstate.cli.common.exports.most_bytes", lambda arguments: 30_000)
     assert main(words(street, tmp_path, "--speed", 20, "--duration", 8)) == 0
     for suffix in ("mcap", "jsonl"):
@@ -314,7 +305,7 @@ def test_a_full_mcap_goes_on_in_a_new_file(street, tmp_path, monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
-def test_an_mcap_that_was_cut_short_reads_up_to_there(street, tmp_path, share):
+def test_a_truncated_mcap_is_read_to_its_end(street, tmp_path, share):
     assert main(words(street, tmp_path, "--speed", 50, "--duration", 4)) == 0
     whole = (tmp_path / "states.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -328,7 +319,7 @@ def test_an_mcap_that_was_cut_short_reads_up_to_there(street, tmp_path, share):
         assert read == full[: len(read)]
 
 
-def test_a_damaged_mcap_is_read_or_refused(tmp_path):
+def test_a_damaged_mcap_is_read_or_raises_an_error(tmp_path):
     path, rng = tmp_path / "a.mcap", random.Random(0)
     with mcap_file(path, GrowingFile) as write:
         for number in range(30):

@@ -1,4 +1,4 @@
-"""Whose datagrams a port takes."""
+"""Accepted and dropped datagrams of a port."""
 
 import argparse
 import hashlib
@@ -34,7 +34,7 @@ def odometry(speed_mps: float, **more: object) -> bytes:
 
 
 def signed(speed_mps: float, number: int, key: bytes = SECRET, **other: object) -> bytes:
-    """Return what a sender of its own writes by the recipe of the page."""
+    """Return a datagram by the recipe of the page."""
     about = {"port": "odometry", "sent_s": time.time(), "number": number}
     text = odometry(speed_mps, **(about | other))
     return text + b"\n" + hmac.new(key, text, hashlib.sha256).hexdigest().encode()
@@ -43,7 +43,7 @@ def signed(speed_mps: float, number: int, key: bytes = SECRET, **other: object) 
 def taken(
     trust: Trust, *sent: tuple[int, bytes], hosts=("127.0.0.1", "127.0.0.1")
 ) -> tuple[list[float], str]:
-    """Send datagrams from two sockets, by number; return the speeds that were taken, and the last problem."""
+    """Send datagrams from two sockets; return the accepted speeds and the last problem."""
     speeds: list[float] = []
     told = OdometrySocket("127.0.0.1:0", nanoseconds, trust)
     senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in hosts]
@@ -51,7 +51,7 @@ def taken(
         sender.bind((host, 0))
     with told:
         for number, datagram in sent:
-            # Before it is sent: the thread that reads counts what it refuses at once.
+            # Set before sending, because the reading thread counts dropped datagrams at once.
             done, until_s = len(speeds) + told.refused, time.monotonic() + 5.0
             senders[number].sendto(datagram, ("127.0.0.1", told.port))
             while len(speeds) + told.refused == done and time.monotonic() < until_s:
@@ -69,23 +69,23 @@ def test_the_first_sender_is_pinned():
     assert "the first one" in problem
 
 
-def test_nonsense_does_not_pin():
+def test_unreadable_datagrams_do_not_pin_a_sender():
     assert taken(Trust(), (1, b"nonsense"), (0, odometry(1)), (1, odometry(2)))[0] == [1]
 
 
-def test_another_sender_follows_one_that_is_silent(monkeypatch):
+def test_another_sender_replaces_a_silent_one(monkeypatch):
     monkeypatch.setattr(live_sensors, "PINNED_S", 0.0)
     assert taken(Trust(), (0, odometry(1, number=7)), (1, odometry(2, number=1)))[0] == [1, 2]
 
 
-def test_only_addresses_that_are_allowed_are_taken():
+def test_only_allowed_addresses_are_accepted():
     sent = (0, odometry(1)), (1, odometry(2))
     speeds, problem = taken(Trust(allow=("127.0.0.2",)), *sent, hosts=("127.0.0.1", "127.0.0.2"))
     assert speeds == [2]
     assert "expected one of 127.0.0.2, got 127.0.0.1" in problem
 
 
-def test_a_host_is_allowed_by_its_name_too():
+def test_hosts_are_allowed_by_name():
     asked = argparse.Namespace(allow=["localhost", "127.0.0.2"], key=None)
     assert _trust(asked).allow == ("127.0.0.1", "127.0.0.2")
     with pytest.raises(InvalidArgumentError, match="--allow: expected hosts"):
@@ -93,27 +93,27 @@ def test_a_host_is_allowed_by_its_name_too():
 
 
 @pytest.mark.parametrize(("age_s", "read"), [(-0.002, True), (-0.05, True), (-0.051, False), (-3600, False)])
-def test_an_age_from_clocks_that_differ_a_little_is_none(age_s, read):
-    """A datagram is not lost with its content for two milliseconds."""
+def test_small_negative_ages_count_as_zero(age_s, read):
+    """Clocks that differ by 2 ms lose no datagram."""
     assert taken(Trust(), (0, odometry(1, age_s=age_s)), (0, odometry(2)))[0] == [1] * read + [2]
 
 
 @pytest.mark.parametrize("age_s", ["x", None, [1], {}, True])
-def test_an_age_that_is_no_number_is_refused(age_s):
+def test_an_age_that_is_no_number_is_dropped(age_s):
     assert taken(Trust(), (0, odometry(1, age_s=age_s)), (0, odometry(2)))[0] == [2]
 
 
-def test_numbers_rise_and_what_is_old_is_left_out():
+def test_datagrams_with_old_numbers_are_dropped():
     sent = [odometry(n, number=n) for n in (1, 2, 2, 1, 3)] + [odometry(4, number=4, age_s=2.1)]
     assert taken(Trust(), *((0, one) for one in sent))[0] == [1, 2, 3]
 
 
-def test_a_key_is_proved_by_any_sender_and_nothing_is_taken_twice():
+def test_signed_datagrams_of_any_sender_are_accepted_once():
     first = signed(1, 1)
     wrong = [
         odometry(2, number=2),
         signed(3, 3, b"another secret of 16 bytes"),
-        signed(4, None),  # without a number it could be sent again
+        signed(4, None),  # without a number it could be replayed
         first,
         first.replace(b'"speed_mps": 1', b'"speed_mps": 9'),
     ]
@@ -131,7 +131,7 @@ def test_a_key_is_proved_by_any_sender_and_nothing_is_taken_twice():
         ({"sent_s": 6.0}, r"sent_s: expected a time within 0.5 s of now, got one -[56]...."),
     ],
 )
-def test_what_was_signed_for_another_port_or_time_is_refused(other, problem):
+def test_signatures_of_other_ports_and_times_are_dropped(other, problem):
     if isinstance(other.get("sent_s"), float):
         other = {"sent_s": time.time() + other["sent_s"]}
     speeds, said = taken(Trust(key=SECRET), (0, signed(1, 1, **other)), (0, signed(2, 2)))
@@ -139,7 +139,7 @@ def test_what_was_signed_for_another_port_or_time_is_refused(other, problem):
     assert re.match(problem, said), said
 
 
-def test_what_was_signed_for_one_camera_is_refused_at_another():
+def test_signatures_of_another_camera_are_dropped():
     look = {"boxes": [], "scores": [], "classes_str": []}
     for camera, looks in (("front", 1), ("rear", 0)):
         seen: list[object] = []
@@ -150,7 +150,7 @@ def test_what_was_signed_for_one_camera_is_refused_at_another():
         assert told.problem == ("" if looks else "port: expected 'detections/rear', got 'detections/front'")
 
 
-def test_a_datagram_that_was_taken_is_refused_after_a_restart():
+def test_accepted_datagrams_are_dropped_after_a_restart():
     first, speeds = signed(1, 7), []
     numbers: dict[str, int] = {}
     for datagram in (first, first, signed(2, 8)):
@@ -168,14 +168,14 @@ def test_a_datagram_that_was_taken_is_refused_after_a_restart():
     assert numbers == {"odometry": 8}
 
 
-def test_numbers_are_kept_with_the_belief(tmp_path):
+def test_numbers_are_saved_with_the_belief(tmp_path):
     save_checkpoint(tmp_path / "a.json", Checkpoint(WorldFilter(), ports=PortNumbers({"odometry": 2**62})))
     before = read_checkpoint(tmp_path / "a.json")
     assert _trust(argparse.Namespace(allow=[], key=None), before).numbers == {"odometry": 2**62}
     assert _trust(argparse.Namespace(allow=[], key=None), Checkpoint(WorldFilter())).numbers == {}
 
 
-def test_rubbish_of_strangers_displaces_nothing_that_waits():
+def test_datagrams_of_strangers_displace_no_queued_ones():
     sent = [live_sensors.signed({"speed_mps": n, "yaw_rate_rad_s": 0.0}, SECRET, "odometry") for n in (1, 2)]
     speeds: list[float] = []
     with OdometrySocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET)) as told:
@@ -190,7 +190,7 @@ def test_rubbish_of_strangers_displaces_nothing_that_waits():
     assert (told.dropped, told.refused) == (0, 1000)
 
 
-def test_the_recipe_of_the_page_is_taken(tmp_path, monkeypatch):
+def test_the_recipe_of_the_page_is_accepted(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "reference" / "live_details.md").read_text("utf-8")
     recipe = next(one for one in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "hmac.new" in one)
     (tmp_path / "secret").write_bytes(SECRET + b"\n")
@@ -214,7 +214,7 @@ def wait_until(holds: Callable[[], object]) -> None:
         time.sleep(0.005)
 
 
-def test_a_short_secret_is_refused(street, tmp_path, capsys):
+def test_a_short_secret_raises_an_error(street, tmp_path, capsys):
     (tmp_path / "key").write_text("short\n")
     play = "--play", str(street / "street.wav"), "--array", str(street / "mics.csv"), "--uncalibrated"
     assert main(["live", *play, "--odometry", "127.0.0.1:0", "--key", str(tmp_path / "key")]) == 2

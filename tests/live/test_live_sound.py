@@ -1,4 +1,4 @@
-"""Sound as it comes: paced, complete, with its losses counted."""
+"""Live sound: pace, completeness and counted losses."""
 
 import threading
 import time
@@ -22,7 +22,7 @@ SETTINGS = ListenSettings(uncalibrated=True)
 
 
 class Scripted:
-    """Blocks that are all there at once, with the number of the first sample of each."""
+    """Blocks that are available at once, with the number of the first sample of each."""
 
     name, sample_rate_hz, channels, speed, overflows = "scripted", RATE, 4, 1.0, 0
 
@@ -59,7 +59,7 @@ def played(source, **options):
     return replace(source, sound=LiveSound(Playback(open_sound(source.sound), **options)))
 
 
-def test_what_is_lost_is_silence_of_the_same_length():
+def test_lost_samples_become_silence_of_the_same_length():
     sound = LiveSound(Scripted(block(0), block(500), block(700)))
     heard = np.concatenate(list(sound.blocks()))
     assert len(heard) == 900 == sound.frames
@@ -71,9 +71,9 @@ def test_what_is_lost_is_silence_of_the_same_length():
 @pytest.mark.parametrize(
     "wrong",
     [
-        block(0),  # delivered again
+        block(0),  # delivered twice
         block(200 - 1_000_000),
-        block(100 * RATE + 200),  # a device that slept
+        block(100 * RATE + 200),  # a device that was suspended
         SoundBlock(np.full((200, 3), 0.5, np.float32), 200, 0.0),
         SoundBlock(np.full(200, 0.5, np.float32), 200, 0.0),
         *(SoundBlock(samples, 200, 0.0) for samples in (None, [[0.5] * 4] * 200, np.float32(0.5))),
@@ -86,7 +86,7 @@ def test_what_is_lost_is_silence_of_the_same_length():
         (block(0).samples, 200, 0.0),
     ],
 )
-def test_a_block_that_is_not_the_next_is_left_out_and_counted(wrong):
+def test_blocks_out_of_order_are_dropped_and_counted(wrong):
     sound = LiveSound(Scripted(block(0), wrong, block(200)))
     heard = np.concatenate(list(sound.blocks()))
     assert heard.shape == (400, 4)
@@ -95,7 +95,7 @@ def test_a_block_that_is_not_the_next_is_left_out_and_counted(wrong):
 
 
 @pytest.mark.parametrize("sample", [np.nan, np.inf, -np.inf, 1e30])
-def test_samples_that_are_no_numbers_are_silence_of_their_microphone(sample):
+def test_invalid_samples_become_silence_of_their_microphone(sample):
     wrong = block(200)
     wrong.samples[7, 2] = sample
     sound = LiveSound(Scripted(block(0), wrong))
@@ -106,7 +106,7 @@ def test_samples_that_are_no_numbers_are_silence_of_their_microphone(sample):
 
 
 class Stalling(Scripted):
-    """Blocks in real time, of which a part is left out, held back, or numbered wrongly."""
+    """Blocks in real time, some omitted, delayed or wrongly numbered."""
 
     def __init__(self, numbers, hold=(), restart=False):
         self.numbers, self.hold, self.restart, self.stopped = numbers, hold, restart, threading.Event()
@@ -131,8 +131,8 @@ class Stalling(Scripted):
         into.close()
 
 
-def test_a_microphone_that_stalls_gives_states_and_keeps_the_time(source):
-    # Silent from 1.25 s to 2.75 s, when all that was held back comes at once.
+def test_a_stalling_microphone_gives_states_in_time(source):
+    # Silent from 1.25 s to 2.75 s, when all delayed blocks arrive at once.
     sound = LiveSound(Stalling(160, hold=range(50, 110)))
     lives = []
     for live in live_steps(replace(source, sound=sound)):
@@ -145,7 +145,7 @@ def test_a_microphone_that_stalls_gives_states_and_keeps_the_time(source):
     assert {one.condition for _, state in lives for one in state.sensors} > {"working"}
 
 
-def test_a_device_that_counts_from_zero_again_is_heard_again():
+def test_a_device_that_restarts_its_count_is_read_again():
     sound = LiveSound(Stalling(120, hold=[40], restart=True))
     heard = np.concatenate(list(sound.blocks()))
     assert heard[-200:].all()
@@ -153,7 +153,7 @@ def test_a_device_that_counts_from_zero_again_is_heard_again():
     assert 10 < sound.refused < 40
 
 
-def test_what_the_sound_refused_is_told_in_the_snapshot(source):
+def test_the_snapshot_has_the_refused_blocks(source):
     noise = np.random.default_rng(6).normal(0.0, 0.1, (60, 200, 4)).astype(np.float32)
     noise[49, 3, 1] = np.nan
     blocks = [SoundBlock(samples, 200 * number, 0.0) for number, samples in enumerate(noise)]
@@ -163,7 +163,7 @@ def test_what_the_sound_refused_is_told_in_the_snapshot(source):
 
 
 @pytest.mark.parametrize("given", [None, "one", -1, float("nan"), 1.5e300, ZeroDivisionError("own"), [1]])
-def test_a_function_of_ones_own_that_fails_counts_and_the_run_goes_on(source, given, caplog):
+def test_a_failing_user_function_is_counted_and_the_run_continues(source, given, caplog):
     def hand_in(listener):
         if isinstance(given, Exception):
             raise given
@@ -171,15 +171,15 @@ def test_a_function_of_ones_own_that_fails_counts_and_the_run_goes_on(source, gi
 
     *_, last = live_steps(played(source, speed=20.0), lambda listener: 0, hand_in)
     assert last.step.state.stamp_ns == 2_000_000_000
-    assert last.step.state.delivery.refused == 81  # one a block, and one at the end
+    assert last.step.state.delivery.refused == 81  # one per block and one at the end
     assert caplog.text.count("hand_in") == 1
 
 
-def test_blocks_that_nobody_took_are_overruns():
+def test_unread_blocks_are_overruns():
     feed = Scripted(*(block(200 * number) for number in range(100)))
     sound = LiveSound(feed)
     heard = np.concatenate(list(sound.blocks()))
-    # 80 blocks of 25 ms wait at most: twenty were dropped, and the time of the others is right.
+    # At most 80 blocks of 25 ms are queued, so twenty were dropped, and the others keep their time.
     assert sound.overruns == 20
     assert len(heard) == 100 * 200
     assert not heard[: 20 * 200].any()
@@ -187,11 +187,11 @@ def test_blocks_that_nobody_took_are_overruns():
     assert feed.stopped
 
 
-def test_of_seconds_that_are_lost_one_window_is_heard_and_the_time_is_kept():
+def test_after_lost_seconds_the_time_is_kept():
     kept = []
     sound = LiveSound(Scripted(*(block(200 * number) for number in range(140))), kept.append)
     heard = np.concatenate(list(sound.blocks()))
-    # Sixty blocks were dropped, then all that waited but the newest.
+    # Sixty blocks were dropped, then all queued ones but the newest.
     assert sound.overruns == 139
     assert 0.9 * RATE <= len(heard) - 200 < RATE
     assert not heard[:-200].any() and heard[-200:].all()
@@ -204,11 +204,11 @@ def test_an_image_is_stamped_on_the_clock_of_the_sound():
     now_s = time.monotonic()
     sound = LiveSound(Scripted(block(0, RATE, now_s), block(RATE, RATE, now_s + 1.0)))
     list(sound.blocks())
-    # The last sample, of second 2, was captured at now + 1: an image a quarter of a second before it.
+    # The last sample, of second 2, was captured at now + 1, 0.25 s after the image.
     assert sound.stamp_ns(now_s + 0.75) == pytest.approx(1.75e9, abs=1e3)
 
 
-def test_other_channels_than_microphones_are_refused(source):
+def test_a_wrong_number_of_channels_raises_an_error(source):
     three = replace(source, sound=LiveSound(Scripted()), array=MicrophoneArray(POSITIONS[:3]))
     with pytest.raises(InputFileError, match="expected 3 channels, one per microphone, got 4"):
         list(live_steps(three))
@@ -219,7 +219,7 @@ def test_a_recording_has_no_latency(source):
         next(live_steps(source))
 
 
-def test_played_it_is_the_same_to_the_last_bit_and_in_real_time(source):
+def test_playback_is_exact_and_in_real_time(source):
     begun_s = time.monotonic()
     lives = list(live_steps(played(source, speed=2.0)))
     took_s = time.monotonic() - begun_s
@@ -229,7 +229,7 @@ def test_played_it_is_the_same_to_the_last_bit_and_in_real_time(source):
     assert (lives[-1].overruns, lives[-1].lost_s) == (0, 0.0)
 
 
-def test_a_longer_run_plays_it_again_and_a_shorter_one_ends_before(source):
+def test_playback_repeats_or_ends_with_the_run(source):
     twice = list(live_steps(played(source, speed=50.0, duration_s=2 * SECONDS)))
     assert twice[-1].step.state.stamp_ns == 4_000_000_000
     short = list(live_steps(played(source, speed=50.0, duration_s=1.3)))
@@ -237,33 +237,33 @@ def test_a_longer_run_plays_it_again_and_a_shorter_one_ends_before(source):
 
 
 @pytest.mark.long
-def test_whoever_is_too_slow_loses_sound_and_keeps_the_time(source):
+def test_a_slow_reader_loses_sound_and_keeps_the_time(source):
     sound = Playback(open_sound(source.sound), speed=100.0, duration_s=80.0)
     slow = replace(source, sound=LiveSound(sound))
     lives = []
     for one in live_steps(slow):
         lives.append(one)
         if len(lives) == 1:
-            time.sleep(0.2)  # twenty seconds of sound go by, of which two wait
+            time.sleep(0.2)  # twenty seconds of sound pass, of which two are queued
     stamps_ns = [one.step.state.stamp_ns for one in lives]
-    # Of what is lost a second is heard as silence, the rest is left out.
+    # One second of the loss becomes silence, the rest is omitted.
     assert min(np.diff(stamps_ns)) == 100_000_000 and max(np.diff(stamps_ns)) > 10_000_000_000
     assert stamps_ns[-1] > 50e9
     assert lives[-1].overruns > 0
     assert lives[-1].lost_s > 10.0
-    # It is told of each window with silence in it.
+    # Each window with silence in it is reported.
     assert "lost samples" in {sensor.reason for one in lives for sensor in one.step.state.heard}
 
 
 @pytest.mark.long
-def test_states_of_a_machine_that_is_too_slow_do_not_fall_ever_further_behind(source):
+def test_the_delay_of_a_slow_machine_is_bounded(source):
     sound = Playback(open_sound(source.sound), speed=20.0, duration_s=80.0)
     slow, ages_s = replace(source, sound=LiveSound(sound)), []
     for one in live_steps(slow):
-        time.sleep(0.01)  # twice what a hop may take
+        time.sleep(0.01)  # twice the allowed time per hop
         ages_s.append(one.latency_s)
     assert one.lost_s > 20.0
-    # Were all that is lost heard as silence, the last third would be five times as late as the first.
+    # If all lost sound became silence, the last third would be five times as late as the first.
     first, _, last = np.array_split(ages_s, 3)
     assert np.median(last) < 2.5 * np.median(first)
 

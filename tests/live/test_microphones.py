@@ -1,4 +1,4 @@
-"""Microphones through PortAudio, of which a stand-in plays the part."""
+"""Microphones through a stand-in for PortAudio."""
 
 import json
 import sys
@@ -21,7 +21,7 @@ LENGTH = RATE // 40
 
 
 class StandIn:
-    """What is used of sounddevice, with one device of four channels."""
+    """Stand-in for sounddevice with one device of four channels."""
 
     class PortAudioError(Exception):
         pass
@@ -83,7 +83,7 @@ def test_blocks_are_copied_in_order(stand_in):
     assert (feed.name, stand_in.stream.channels, stand_in.stream.blocksize) == ("roof array", 4, LENGTH)
 
 
-def test_an_overflow_of_the_device_is_counted_and_its_length_filled(stand_in):
+def test_an_overflow_is_counted_and_filled(stand_in):
     sound, samples = heard(
         stand_in, PortAudioInput(4, RATE), [(0.1, 5.0), (0.2, 5.025), (0.3, 5.125, "lost 75 ms")]
     )
@@ -99,7 +99,7 @@ def test_an_overflow_without_capture_times_is_counted(stand_in):
 
 def test_the_age_of_a_block_is_that_of_its_last_sample(stand_in):
     sound, _ = heard(stand_in, PortAudioInput(4, RATE), [(0.1, 5.0)])
-    # The stand-in calls 10 ms after the block's end.
+    # The stand-in calls 10 ms after the end of the block.
     assert 0.01 <= sound.age_s(LENGTH) < 0.5
     assert sound.age_s(0) - sound.age_s(LENGTH) == pytest.approx(LENGTH / RATE, abs=5e-3)
     assert sound.stamp_ns(time.monotonic()) >= 1e9 * (LENGTH / RATE + 0.01)
@@ -109,19 +109,19 @@ def test_the_age_of_a_block_is_that_of_its_last_sample(stand_in):
     ("channels", "device", "said"),
     [(56, None, "56 channels at 8000 Hz"), (4, "cellar", "No input device matching 'cellar'")],
 )
-def test_a_device_that_does_not_fit_is_refused_with_those_that_there_are(stand_in, channels, device, said):
+def test_a_wrong_device_raises_an_error_with_the_devices(stand_in, channels, device, said):
     with pytest.raises(InvalidArgumentError, match=said) as refused:
         PortAudioInput(channels, RATE, device)
     assert "3 roof array (4)" in str(refused.value)
 
 
-def test_no_microphones_at_all(stand_in, monkeypatch):
+def test_no_devices_raise_an_error(stand_in, monkeypatch):
     monkeypatch.setattr(stand_in, "query_devices", lambda *_: [])
     with pytest.raises(InvalidArgumentError, match="PortAudio finds none"):
         PortAudioInput(4, RATE)
 
 
-def test_what_is_missing_is_named(monkeypatch):
+def test_missing_packages_and_libraries_raise_an_error(monkeypatch):
     def without_library(name):
         raise OSError("PortAudio library not found")
 
@@ -159,7 +159,7 @@ def test_the_command_records_from_the_device_until_the_duration(stand_in, tmp_pa
         ('{"positions_m": [[0, 0.1, 0], [0, -0.1, 0.05]], "channels": [3, 1]}', 3),
     ],
 )
-def test_the_command_hears_the_channels_that_microphones_are_on(
+def test_the_command_selects_the_channels_of_microphones(
     stand_in, tmp_path, capsys, monkeypatch, given, opened
 ):
     (tmp_path / "mics").write_text(given)
@@ -193,7 +193,7 @@ def test_the_command_hears_the_channels_that_microphones_are_on(
     assert bearings(kept, *options) == bearings(chosen, "--array", str(tmp_path / "two.csv"))
 
 
-def test_a_recording_with_more_channels_is_played(tmp_path, capsys):
+def test_channels_of_a_played_recording_are_selected(tmp_path, capsys):
     sound = np.random.default_rng(5).normal(0.0, 0.1, (RATE * 3 // 2, 6))
     soundfile.write(tmp_path / "card.wav", sound, RATE)
     soundfile.write(tmp_path / "chosen.wav", sound[:, [4, 2, 3, 1]], RATE)
@@ -210,6 +210,6 @@ def test_a_recording_with_more_channels_is_played(tmp_path, capsys):
     assert found[0]
 
 
-def test_the_command_asks_for_the_array(stand_in, capsys):
+def test_the_command_needs_an_array(stand_in, capsys):
     assert main(["live"]) == 2
     assert "--array: expected the positions of the microphones, or --car" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A run with a fault every second or sooner: an hour in `make slow`, or WORLDSTATE_SOAK_S seconds."""
+"""A run with at least one fault per second: an hour in `make slow`, or WORLDSTATE_SOAK_S seconds."""
 
 import json
 import os
@@ -42,7 +42,7 @@ RANGES = (
 )  # fmt: skip
 SPEEDS = ({"speed_mps": 1e30}, {"speed_mps": float("nan")}, {"speed_mps": 1, "x_m": 3}, {"speed_mps": None})
 SAMPLES = np.nan, np.inf, -1e30, 1e6, 0.5
-# What a callback of one's own gives in place of its boxes.
+# Wrong values of a user's callback in place of boxes.
 GIVEN = (
     None,
     RuntimeError("a detector that fails"),
@@ -52,13 +52,13 @@ GIVEN = (
 
 
 class Faulty:
-    """Microphones in real time, in which every second something else goes wrong, and the programs beside."""
+    """Microphones in real time with a different fault per second, and the programs beside."""
 
     channels, sample_rate_hz, speed, overflows, name = 4, RATE, 1.0, 0, "faulty"
 
     def __init__(self, ports: tuple[int, int], websocket: int, key: bytes | None, length_s: float) -> None:
         self.ports, self.websocket, self._key, self._length_s = ports, websocket, key, length_s
-        # Blocks from one fault to the next: a second of a long run
+        # Blocks between two faults: one second of a long run
         self.every = 40 if length_s > 60.0 else 14
         self.kinds = [name for name in vars(Faulty) if name.startswith("_fault_")]
         self.faults, self.bytes, self.images = Counter[str](), list[int](), image_channel()
@@ -82,7 +82,7 @@ class Faulty:
         """Fail as a detector of one's own may."""
         given = GIVEN[int(image[0, 0, 0]) % len(GIVEN)]
         if isinstance(given, Exception):
-            # A new one: what is raised again keeps the frames of every time before, and their images.
+            # A new exception, because a raised one keeps the frames and images of every earlier time.
             raise type(given)(*given.args)
         return given
 
@@ -160,7 +160,7 @@ class Faulty:
     def _spoilt(self, block: SoundBlock, first: int = 0, captured_s: float = 0.0) -> SoundBlock:
         return SoundBlock(block.samples, block.first + first, block.captured_s + captured_s)
 
-    # Each returns what comes in place of a block, None for the block itself.
+    # Each returns the replacement of a block, or None for the block itself.
 
     def _fault_samples_out_of_range(self, block):
         block.samples[7, self.faults.total() % 4] = SAMPLES[self.faults.total() % len(SAMPLES)]
@@ -181,7 +181,7 @@ class Faulty:
         return [SoundBlock(block.samples[:, :2], block.first, block.captured_s)]
 
     def _fault_stall_and_burst(self, block):
-        self._stopped.wait(0.7)  # what was due meanwhile comes at once
+        self._stopped.wait(0.7)  # the delayed blocks arrive at once
 
     def _fault_clock_jumps_ahead(self, block):
         return [self._spoilt(block, captured_s=3600.0)]
@@ -260,7 +260,7 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
         pytest.param(LONG_S, SECRET, marks=pytest.mark.slow),
     ],
 )
-def test_a_run_with_a_fault_every_second_goes_on(
+def test_a_run_with_a_fault_every_second_continues(
     length_s, key, street, tmp_path, capsys, caplog, monkeypatch
 ):
     ports, websocket = (free_port(), free_port()), free_port(socket.SOCK_STREAM)
@@ -297,7 +297,7 @@ def test_a_run_with_a_fault_every_second_goes_on(
     assert set(feed.faults) == {name.removeprefix("_fault_") for name in feed.kinds}
     assert faults >= 0.9 * 40 / feed.every * (length_s - 3.0) - 1
     assert report["detections_refused"] + report["odometry_refused"] > 100 * faults
-    # A machine with more to do than it has cores is too slow: what it loses is counted.
+    # A machine with more work than cores is too slow, and its losses are counted.
     if report["load"] < os.cpu_count():
         assert report["detections_dropped"] <= 64  # of the first second
         assert left_out <= 0.02 * 10 * length_s
@@ -309,11 +309,11 @@ def test_a_run_with_a_fault_every_second_goes_on(
             logged, follows = logged + 1, before and state.stamp_ns - before.stamp_ns == HOP_NS
             assert broken_laws(state, before if follows else None) == []
             before = state
-    # All that is missing was counted as lost, or left out of a gap in the sound.
+    # All missing time was counted as lost or omitted in a gap of the sound.
     assert logged + lost == report["states"]
     assert (before.stamp_ns - 1_000_000_000) // HOP_NS + 1 == logged + lost + left_out
     assert before.delivery.refused > 0.5 * faults
-    # MCAP that could not be written ends there, until it begins anew.
+    # An MCAP file that could not be written ends there, until it restarts.
     *_, (_, last) = read_log(tmp_path / "s.mcap")
     assert before.stamp_ns - last.stamp_ns <= 6_000_000_000
     assert read_checkpoint(tmp_path / "belief.json").world.stamp_ns == before.stamp_ns

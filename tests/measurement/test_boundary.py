@@ -125,11 +125,7 @@ def test_a_wrong_field_is_refused_with_its_name(whole):
             except InvalidArgumentError as error:
                 # With a valid velocity the covariance has the wrong size.
                 text = str(error).replace("covariance:", f"{name}:")
-                assert re.match(rf"{name}\b.*: expected .*, got .", text, re.DOTALL), (
-                    name,
-                    wrong,
-                    error,
-                )
+                assert re.match(rf"{name}\b.*: expected .*, got .", text, re.DOTALL), (name, wrong, error)
                 refused += 1
             else:
                 if isinstance(built, Measurement | PositionScan | Odometry):

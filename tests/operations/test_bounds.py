@@ -33,11 +33,7 @@ def test_the_built_in_array_has_the_bound_of_the_paper():
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    positions=positions_strategy,
-    azimuth=st.floats(-3.1, 3.1),
-    snr=st.floats(0.01, 100.0),
-)
+@given(positions=positions_strategy, azimuth=st.floats(-3.1, 3.1), snr=st.floats(0.01, 100.0))
 def test_information_equals_a_numerical_fisher_matrix(positions, azimuth, snr):
     """Oracle: 2 SNR Re(d^H (I - a a^H / M) d), the derivative of the steering vector by differences."""
     frequency, h = 700.0, 1e-5

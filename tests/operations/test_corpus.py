@@ -1,4 +1,4 @@
-"""A corpus heard: its tables, the same bytes for any workers and after kills, and what a second run does."""
+"""Tables of a corpus: content, independence of workers and kills, and repeated runs."""
 
 import json
 import re
@@ -45,7 +45,7 @@ pytest.importorskip("pyarrow")
 
 @pytest.fixture(scope="module")
 def corpus(street, tmp_path_factory) -> Path:
-    """Return a folder with sound of two sites, a log of snapshots, and a file that is no sound."""
+    """Return a folder with sound of two sites, a log of snapshots and a file that is no sound."""
     folder = tmp_path_factory.mktemp("corpus")
     for name in ("north/a.wav", "north/b.wav", "south/c.wav"):
         (folder / name).parent.mkdir(exist_ok=True)
@@ -100,7 +100,7 @@ def test_an_array_without_a_model_gives_no_scores(street, tmp_path):
 
 @pytest.fixture(scope="module")
 def demo(approach, tmp_path_factory) -> tuple[Path, RecordingReport, HopTable]:
-    """Return the demo's approach heard with its hops, and the report and the hop stream of `run`."""
+    """Return the corpus tables of the demo approach, and the report and hop stream of `run`."""
     folder, measured = tmp_path_factory.mktemp("demo"), []
     hear(approach.folder, folder / "heard", hops=True)
     report = run_recording(
@@ -111,19 +111,19 @@ def demo(approach, tmp_path_factory) -> tuple[Path, RecordingReport, HopTable]:
     return folder, report, hop_stream(measured, name="demo")
 
 
-def test_a_recording_gives_the_advisories_of_run_and_the_vehicle_that_was_seen(demo):
+def test_a_corpus_has_the_advisories_of_run_and_the_seen_vehicle(demo):
     folder, report, _ = demo
     (recording,), approaches = rows(folder / "heard", "recordings"), rows(folder / "heard", "approaches")
     assert (recording.hops, recording.failure) == (report.hops, None)
     assert recording.onsets == len(report.warning.advisory_onsets_s)
     assert {one.time_s for one in approaches} >= {*report.warning.advisory_onsets_s}
-    # The demo's van comes from the right, and its camera finds it.
+    # The van of the demo comes from the right and is detected by the camera.
     (van,) = (one for one in approaches if one.seen)
     assert van.side == "right" and van.label == "car"
     assert van.lead_s == pytest.approx(van.seen_s - van.time_s) and 1.0 < van.lead_s < 5.0
 
 
-def test_logs_are_read_from_the_hops_of_a_recording_as_from_the_log_of_run(demo, capsys):
+def test_tables_of_hops_and_logs_of_run_are_read_alike(demo, capsys):
     folder, _, _ = demo
     (hops,) = (folder / "heard" / "hops").glob("*.parquet")
     printed = [
@@ -134,7 +134,7 @@ def test_logs_are_read_from_the_hops_of_a_recording_as_from_the_log_of_run(demo,
     assert (folder / "again.jsonl").read_text() == (folder / "states.jsonl").read_text()
 
 
-def test_a_file_that_is_no_table_of_hops_is_refused(demo, tmp_path, capsys):
+def test_a_file_that_is_no_table_of_hops_raises_an_error(demo, tmp_path, capsys):
     (tmp_path / "a.parquet").write_text("no table")
     (recording,) = (demo[0] / "heard" / "recordings").glob("*.parquet")
     for log in (tmp_path / "a.parquet", recording):
@@ -142,12 +142,12 @@ def test_a_file_that_is_no_table_of_hops_is_refused(demo, tmp_path, capsys):
         assert "expected a table of hops with snapshots" in capsys.readouterr().err
 
 
-def test_thresholds_are_set_on_hops_as_on_the_sound_itself(demo, tmp_path, capsys):
+def test_thresholds_on_hops_equal_those_on_sound(demo, tmp_path, capsys):
     folder, report, stream = demo
     (heard,) = hop_streams(folder / "heard")
     for name, column in stream.columns.items():
         np.testing.assert_array_equal(heard.columns[name], column)
-    # At the threshold of the run the curve has the onsets that the filter raised.
+    # At the threshold of the run the curve has the onsets of the filter.
     model = read_model()
     levels = np.nan_to_num(np.column_stack([heard.level_left, heard.level_right]), nan=-np.inf)
     raised = raised_at(levels, model.sequence.alarm.threshold_nats)
@@ -159,7 +159,7 @@ def test_thresholds_are_set_on_hops_as_on_the_sound_itself(demo, tmp_path, capsy
     assert read_model(tmp_path / "mine.json").sequence.curve.hours == pytest.approx(report.hops / 36_000)
 
 
-def test_windows_are_labelled_as_by_the_camera_s_own_tracks(demo, approach, tmp_path):
+def test_labels_of_windows_equal_those_of_camera_tracks(demo, approach, tmp_path):
     root = tmp_path / "root"
     shutil.copytree(approach.folder, root / "SB1" / "right" / "demo")
     recording = str(root / "SB1" / "right" / "demo")
@@ -173,25 +173,25 @@ def test_windows_are_labelled_as_by_the_camera_s_own_tracks(demo, approach, tmp_
         assert one.end_s == pytest.approx(other.end_s, abs=0.3) and one.path == other.path
 
 
-def test_without_a_camera_no_window_counts_as_one_of_nothing(heard, tmp_path):
+def test_without_a_camera_no_window_is_labelled_empty(heard, tmp_path):
     words = ["street", "label", str(heard), "--windows", str(tmp_path / "labels.csv")]
     assert main(words) == 0
     assert len((tmp_path / "labels.csv").read_text().splitlines()) == 1
     assert main([*words, "--out", str(tmp_path / "labels.json")]) == 2
 
 
-def test_thresholds_of_a_corpus_without_hops_say_how_to_write_them(heard, tmp_path, capsys):
+def test_thresholds_without_hops_raise_an_error(heard, tmp_path, capsys):
     assert main(["model", "threshold", str(heard), "--out", str(tmp_path / "mine.json")]) == 2
     assert "expected hops of sound: `worldstate hear --hops` writes them" in capsys.readouterr().err
 
 
-def test_what_cannot_be_heard_is_a_row_with_its_failure(heard):
+def test_an_unreadable_recording_is_a_row_with_its_error(heard):
     failed = [row for row in rows(heard, "recordings") if row.failure]
     assert [(row.recording, row.site, row.hops) for row in failed] == [("south/broken.wav", "south", 0)]
     assert failed[0].failure.startswith("south/broken.wav: expected WAV")
 
 
-def test_a_log_of_snapshots_is_counted_as_it_stands(heard, corpus):
+def test_a_log_of_snapshots_is_counted(heard, corpus):
     logged = [row for row in rows(heard, "hours") if row.recording == "south/log.jsonl"]
     states = [
         WorldState.from_json(line) for line in (corpus / "south" / "log.jsonl").read_text().splitlines()
@@ -199,7 +199,7 @@ def test_a_log_of_snapshots_is_counted_as_it_stands(heard, corpus):
     assert sum(row.hops for row in logged) == len(states)
 
 
-def test_sound_and_its_bag_are_heard_alike(street, options, tmp_path):
+def test_sound_and_its_bag_give_the_same_rows(street, options, tmp_path):
     pytest.importorskip("rosbags")
     samples, rate_hz = soundfile.read(street / "street.wav", dtype="float32")
     shutil.copy(street / "street.wav", tmp_path / "a.wav")
@@ -217,12 +217,12 @@ def test_sound_and_its_bag_are_heard_alike(street, options, tmp_path):
         scores[row.recording].append(row.log_likelihoods)
     assert {*scores} == {"a.wav", "alone.mcap", "bag"}
     assert scores["a.wav"] == scores["alone.mcap"] == scores["bag"]
-    # Only messages state the time of day.
+    # Only messages have the time of day.
     days = {row.recording: row.day for row in rows(tmp_path / "heard", "hours")}
     assert days == {"a.wav": None, "alone.mcap": "2025-11-24", "bag": "2025-11-24"}
 
 
-def test_the_reference_names_every_column_of_every_table():
+def test_the_reference_lists_every_column():
     page = (Path(__file__).parents[2] / "docs" / "reference" / "viewer_formats.md").read_text("utf-8")
     told = dict(re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| (.*) \|$", page, flags=re.M))
     for table, kind in TABLES.items():
@@ -230,19 +230,16 @@ def test_the_reference_names_every_column_of_every_table():
         assert columns == set(re.findall(r"`(\w+)`", told[table]))
 
 
-WAYS = {
-    "two processes": {"jobs": 2},
-    "threads": {"executor": ThreadPoolExecutor(3)},
-}
+WAYS = {"two processes": {"jobs": 2}, "threads": {"executor": ThreadPoolExecutor(3)}}
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_tables_are_the_same_bytes_however_many_work(way, corpus, options, heard, tmp_path):
+def test_tables_do_not_depend_on_the_number_of_workers(way, corpus, options, heard, tmp_path):
     hear(corpus, tmp_path, **options, **WAYS[way])
     assert contents(tmp_path) == contents(heard)
 
 
-def test_shares_of_several_machines_make_up_the_whole(corpus, options, heard, tmp_path):
+def test_shards_add_up_to_the_whole(corpus, options, heard, tmp_path):
     shares = [hear(corpus, tmp_path, shard=(number, 3), **options) for number in (1, 2, 3)]
     assert sorted(one.recording for share in shares for one in share) == [
         one.name for one in find_corpus(corpus)
@@ -250,13 +247,13 @@ def test_shares_of_several_machines_make_up_the_whole(corpus, options, heard, tm
     assert contents(tmp_path) == contents(heard)
 
 
-def test_the_same_corpus_elsewhere_has_the_same_tables(corpus, options, heard, tmp_path):
+def test_tables_do_not_depend_on_the_folder(corpus, options, heard, tmp_path):
     shutil.copytree(corpus, tmp_path / "moved")
     hear(tmp_path / "moved", tmp_path / "out", **options)
     assert contents(tmp_path / "out") == contents(heard)
 
 
-def test_a_second_run_hears_what_is_new_or_changed_and_nothing_else(corpus, options, street, tmp_path):
+def test_a_second_run_reads_only_new_and_changed_files(corpus, options, street, tmp_path):
     shutil.copytree(corpus, tmp_path / "corpus")
     hear(tmp_path / "corpus", tmp_path / "out", **options)
     before = contents(tmp_path / "out")
@@ -269,11 +266,11 @@ def test_a_second_run_hears_what_is_new_or_changed_and_nothing_else(corpus, opti
     shutil.copy(street / "street.wav", tmp_path / "corpus" / "d.wav")
     third = hear(tmp_path / "corpus", tmp_path / "out", **options)
     assert {one.recording for one in third if one.status == "heard"} == {"north/a.wav", "d.wav"}
-    # Of the changed one nothing else is left, so that no hour counts twice.
+    # Nothing else of the changed file remains, so no hour counts twice.
     assert len([row for row in rows(tmp_path / "out", "recordings") if row.recording == "north/a.wav"]) == 1
 
 
-def test_a_failure_that_may_pass_is_tried_again(corpus, options, heard, tmp_path, monkeypatch):
+def test_temporary_failures_are_retried(corpus, options, heard, tmp_path, monkeypatch):
     from worldstate.operations.corpus import corpus_run
 
     def fails(*given: object) -> None:
@@ -300,7 +297,7 @@ def test_a_folder_begun_with_other_options_raises_an_error(named, corpus, option
         hear(corpus, heard, **options | OTHERS[named])
 
 
-def test_a_manifest_names_sites_and_what_belongs_to_a_recording(corpus, tmp_path):
+def test_a_manifest_has_sites_and_detections(corpus, tmp_path):
     (corpus / "list.csv").write_text(
         "path,site,detections\nsouth/c.wav,elm street,\nnorth/a.wav,,boxes.json\n"
     )
@@ -325,7 +322,7 @@ def test_wrong_shards_raise_an_error(corpus, options, tmp_path):
 
 
 def states_of(raised: list[set[str]]) -> list[WorldState]:
-    """Return a state a hop with an advisory of each side that is named, from its onset on."""
+    """Return one state per hop with advisories of the given sides from their onsets."""
     states, since = [], dict[str, int]()
     for hop, sides in enumerate(raised, start=1):
         stamp_ns = nanoseconds(0.1 * hop)
@@ -342,7 +339,7 @@ def states_of(raised: list[set[str]]) -> list[WorldState]:
 
 
 @given(st.lists(st.sets(st.sampled_from(["left", "right"])), min_size=1, max_size=30))
-def test_approaches_and_onsets_are_those_that_explain_and_run_count(raised):
+def test_approaches_and_onsets_equal_those_of_explain_and_run(raised):
     states = states_of(raised)
     meter, warnings = ApproachMeter("a", ""), WarningMeter(None)
     for state in states:
@@ -355,7 +352,7 @@ def test_approaches_and_onsets_are_those_that_explain_and_run_count(raised):
     assert sum(row.hops for row in meter.hours()) == len(states)
 
 
-def test_a_vehicle_that_nothing_announced_is_an_approach_too():
+def test_an_unannounced_vehicle_is_an_approach():
     *_, in_view, _ = scripted_states()
     meter = ApproachMeter("a", "")
     meter.update(replace(in_view, cues=()))
@@ -363,11 +360,11 @@ def test_a_vehicle_that_nothing_announced_is_an_approach_too():
     assert (missed.side, missed.time_s, missed.seen, missed.lead_s) == ("left", None, True, None)
 
 
-def test_shadow_hours_are_those_of_all_recordings_heard_to_their_end(corpus, heard, street, tmp_path, capsys):
+def test_shadow_hours_are_those_of_completed_recordings(corpus, heard, street, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(heard, out)
     words = ["hear", str(corpus), "--array", str(street / "mics.csv"), "--uncalibrated", "--out", str(out)]
-    # As a kill leaves it: tables are there, the row of the recording is not.
+    # As after a kill: there are tables without the row of the recording.
     killed = next(iter((out / "recordings").glob("*.parquet")))
     (out / "hours" / killed.name).with_stem("f" * 16 + "-left").write_bytes(b"")
     assert main([*words, "--shadow", "--json"]) == 0
@@ -381,7 +378,7 @@ def test_shadow_hours_are_those_of_all_recordings_heard_to_their_end(corpus, hea
 
 @pytest.fixture(scope="module")
 def quiet(street, tmp_path_factory) -> Path:
-    """Return a folder with twice 30 s of each microphone's own noise in which a common sound lasts 3 s."""
+    """Return a folder with 2 x 30 s of incoherent noise in which a common sound lasts 3 s."""
     folder = tmp_path_factory.mktemp("quiet")
     sound = np.random.default_rng(1).normal(0.0, 0.01, (240_000, 4))
     sound[120_000:144_000] += np.random.default_rng(2).normal(0.0, 0.02, (24_000, 1))
@@ -396,7 +393,7 @@ def sampled(name: str) -> bool:
     return int(CorpusInput(name, Path(name), "").key, 16) % SAMPLED == 0
 
 
-def test_a_cascade_hears_what_is_louder_and_what_lies_around_it(quiet, options, tmp_path):
+def test_a_cascade_reads_loud_sound_and_its_surroundings(quiet, options, tmp_path):
     part = open_source(quiet / "part.wav", **options)
     assert np.flatnonzero(kept_seconds(part)).tolist() == [*range(15 - BEFORE_S, 18 + AFTER_S)]
     hear(quiet, tmp_path, cascade=True, **options)
@@ -422,7 +419,7 @@ def test_the_recall_of_a_cascade_is_measured_on_whole_recordings(quiet, options,
 
 
 @pytest.mark.long
-def test_tables_are_the_same_bytes_with_two_workers_of_dask(corpus, street, heard, tmp_path):
+def test_tables_are_equal_with_two_workers_of_dask(corpus, street, heard, tmp_path):
     distributed = pytest.importorskip("distributed")
     words = ["hear", str(corpus), "--array", str(street / "mics.csv"), "--uncalibrated"]
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -431,7 +428,7 @@ def test_tables_are_the_same_bytes_with_two_workers_of_dask(corpus, street, hear
         assert contents(tmp_path) == contents(heard)
 
 
-def test_a_scheduler_that_is_none_is_named(corpus, tmp_path, capsys, monkeypatch):
+def test_a_wrong_scheduler_raises_an_error(corpus, tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("worldstate.cli.hear._CONNECT_S", 0.1)
     words = ["hear", str(corpus), "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:9"]
@@ -440,7 +437,7 @@ def test_a_scheduler_that_is_none_is_named(corpus, tmp_path, capsys, monkeypatch
 
 
 @pytest.mark.long
-def test_tables_are_the_same_bytes_after_ten_kills(corpus, street, heard, tmp_path):
+def test_tables_are_equal_after_ten_kills(corpus, street, heard, tmp_path):
     words = [
         "hear",
         str(corpus),
@@ -455,7 +452,7 @@ def test_tables_are_the_same_bytes_after_ten_kills(corpus, street, heard, tmp_pa
         jobs = ["--jobs", "2"] if kill in (4, 7) else []
         with subprocess.Popen([sys.executable, "-m", "worldstate", *words, *jobs]) as run:
             deadline = time.monotonic() + 60.0
-            # Further into the run with each kill: before the first file, between files, within one.
+            # Later with each kill: before the first file, between files, within one.
             while run.poll() is None and time.monotonic() < deadline:
                 if len([*tmp_path.glob("*/*.parquet")]) >= kill:
                     run.send_signal(signal.SIGKILL if kill % 2 else signal.SIGTERM)

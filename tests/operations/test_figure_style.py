@@ -1,4 +1,4 @@
-"""Figures are written whole, in a format that the name says, and leave the caller's settings alone."""
+"""Figure files: format by name, whole files and unchanged settings of the caller."""
 
 from itertools import combinations
 
@@ -23,13 +23,13 @@ MEANINGS = HIDDEN, IN_VIEW, SEARCHED, HEARD, TRUTH, DECISION
 
 
 @pytest.mark.parametrize("name", ["a.xyz", "a", "a.jpg"])
-def test_a_suffix_that_cannot_be_drawn_is_refused_before_anything_is(name, tmp_path):
+def test_an_unknown_figure_format_raises_an_error_before_drawing(name, tmp_path):
     with pytest.raises(InputFileError, match=r"\.png, \.svg, \.pdf"), figure_file(tmp_path / name, 3, 2):
         pytest.fail("drawn")
     assert not list(tmp_path.iterdir())
 
 
-def test_the_same_figure_gives_the_same_file_and_style_stays_within(tmp_path):
+def test_figures_are_reproducible_and_keep_the_style_of_the_caller(tmp_path):
     before = dict(mpl.rcParams)
     for name in ("a.svg", "b.svg"):
         with figure_file(tmp_path / name, 3, 2) as figure:
@@ -50,7 +50,7 @@ def test_a_figure_that_fails_leaves_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-# From linear sRGB to what a protanope, deuteranope and tritanope see (Machado et al. 2009), and to CIE XYZ.
+# Linear sRGB as seen with protanopia, deuteranopia and tritanopia (Machado et al. 2009), and CIE XYZ.
 SEEN = np.array([
     np.eye(3),
     [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
@@ -72,12 +72,12 @@ def lab(seen):
 
 
 @pytest.mark.parametrize("colours", [MEANINGS, CATEGORIES])
-def test_colours_are_told_apart_with_any_colour_vision(colours):
+def test_colours_differ_with_any_colour_vision(colours):
     for one, other in combinations(colours, 2):
         apart = [np.linalg.norm(lab(seen @ linear(one)) - lab(seen @ linear(other))) for seen in SEEN]
         assert min(apart) > 15.0, (one, other)
 
 
 @pytest.mark.parametrize("colour", MEANINGS)
-def test_a_line_of_a_meaning_is_seen_on_white_paper(colour):
+def test_colours_have_contrast_on_white(colour):
     assert 1.05 / (XYZ[1] @ linear(colour) + 0.05) > 3.0

@@ -1,4 +1,4 @@
-"""Recordings and arrays as users have them: bearings, bounds and doctor take them all."""
+"""Recordings and arrays of users in bearings, bounds and doctor."""
 
 import csv
 import io
@@ -80,7 +80,7 @@ def write_array(path: Path, positions: list[list[float]]) -> Path:
 
 
 def wave(array: MicrophoneArray, azimuth_deg: float, duration_s: float = 1.3) -> np.ndarray:
-    """White noise from one direction, with a little of its own in each microphone."""
+    """Return white noise from one direction with some independent noise per microphone."""
     n = round(RATE * duration_s)
     spectrum = np.fft.rfft(np.random.default_rng(0).normal(0, 0.1, n))
     delays = array.delays_s(math.radians(azimuth_deg))
@@ -101,7 +101,7 @@ def sources_of(path: Path) -> np.ndarray:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("number", "name"), list(enumerate(OWN)))
-def test_no_command_refuses_a_right_array(number: int, name: str, tmp_path: Path) -> None:
+def test_all_commands_accept_all_arrays(number: int, name: str, tmp_path: Path) -> None:
     file = write_array(tmp_path / f"mics.{FORMS[number % 4]}", OWN[name])
     array = read_array(file)
     np.testing.assert_allclose(array.positions_m, OWN[name])
@@ -117,7 +117,7 @@ def test_no_command_refuses_a_right_array(number: int, name: str, tmp_path: Path
     assert main(["array", "check", str(tmp_path / "a.wav"), *given]) in (0, 1)
 
 
-def test_all_round_with_a_ring(tmp_path: Path) -> None:
+def test_a_ring_gives_bearings_all_round(tmp_path: Path) -> None:
     array = MicrophoneArray(ring(8, 0.2))
     file = write_array(tmp_path / "ring.csv", ring(8, 0.2))
     soundfile.write(tmp_path / "a.wav", wave(array, 150.0), RATE)
@@ -141,7 +141,7 @@ def test_two_sources_are_counted(tmp_path: Path) -> None:
     assert sources_of(tmp_path / "b.csv")[0] == 2
 
 
-def test_a_dead_microphone_is_no_reason_for_waves(tmp_path: Path) -> None:
+def test_a_dead_microphone_gives_no_sources(tmp_path: Path) -> None:
     noise = np.random.default_rng(3).normal(0, 0.05, (3 * RATE, 4)) * [1.0, 1.0, 0.0, 1.0]
     soundfile.write(tmp_path / "a.wav", noise, RATE)
     file = write_array(tmp_path / "ring.csv", ring(4, 0.2))
@@ -192,14 +192,14 @@ def test_raw_samples_on_standard_input(
         (4 * RATE, "one constant"),
     ],
 )
-def test_bad_pipes(n_bytes: int, problem: str) -> None:
+def test_bad_samples_on_a_pipe_raise_an_error(n_bytes: int, problem: str) -> None:
     with pytest.raises(InputFileError, match=problem):
         open_sound(RawPcm(io.BytesIO(bytes(n_bytes)), RATE, 2))
     with pytest.raises(InputFileError, match="expected 3 channels"):
         open_sound(RawPcm(io.BytesIO(bytes(n_bytes - n_bytes % 4)), RATE, 2), 3)
 
 
-def test_a_file_a_microphone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_file_per_microphone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     array = MicrophoneArray(ring(4, 0.2))
     sound = wave(array, 20.0)
     file, out = write_array(tmp_path / "m.csv", ring(4, 0.2)), tmp_path / "b.csv"
@@ -221,14 +221,14 @@ def test_a_file_a_microphone(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def recorded_by_card(path: Path, sound: np.ndarray, silent: int) -> Path:
-    """Write a beam and the microphones, as a card gives them, and so many channels that stay silent."""
+    """Write a beam, the microphones and silent channels as a sound card does."""
     beam = np.random.default_rng(4).normal(0, 0.3, (len(sound), 1))
     soundfile.write(path, np.hstack([beam, sound, np.zeros((len(sound), silent))]), RATE)
     return path
 
 
 @pytest.mark.parametrize("silent", [1, 12])
-def test_a_card_with_more_channels_than_microphones(
+def test_channels_of_a_sound_card_are_selected(
     silent: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     array, out = read_array("respeaker-usb"), tmp_path / "b.csv"
@@ -278,7 +278,7 @@ def test_a_card_with_more_channels_than_microphones(
         ([], "card.wav: expected 4 channels, one per microphone, got 6; .channels. in the JSON file"),
     ],
 )
-def test_channels_that_cannot_be_chosen(
+def test_wrong_channels_raise_an_error(
     channels: list[int], problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "m.json"

@@ -1,4 +1,4 @@
-"""Labels of passes: tracks of boxes, T0 and hidden places of a camera that is simulated by hand."""
+"""Labels of passes of a simulated camera: tracks, T0 and hidden positions."""
 
 import json
 import math
@@ -36,7 +36,7 @@ def labelled():
     return starts, tracks, label_passes(tracks)
 
 
-def test_every_pass_has_its_arm_and_its_t0(labelled):
+def test_every_pass_has_arm_and_t0(labelled):
     starts, _, passes = labelled
     assert [one.arm for one in passes] == ["left", "right", "left"]
     for (start, _), one in zip(starts, passes, strict=True):
@@ -44,7 +44,7 @@ def test_every_pass_has_its_arm_and_its_t0(labelled):
         assert one.t0.std_s < 0.2
 
 
-def test_hidden_places_lie_within_what_is_stated(labelled):
+def test_hidden_positions_are_within_their_intervals(labelled):
     starts, _, passes = labelled
     for (start, side), one in zip(starts, passes, strict=True):
         hidden = one.track.time_s < t0_s(start, 5.0)
@@ -54,9 +54,9 @@ def test_hidden_places_lie_within_what_is_stated(labelled):
         assert (np.hypot(*off.T) < 3.0 * one.track.position_std_m[hidden]).all()
 
 
-def test_a_hidden_place_is_not_stated_wider_than_drivers_vary(labelled):
-    # Simulated drivers are off by 1.1 m two seconds before T0. Stated along the
-    # longest axis: 1.9 m, and 2.7 m with the 1 m^2/s^3 of acceleration that passes were smoothed with before.
+def test_intervals_of_hidden_positions_are_not_too_wide(labelled):
+    # Simulated drivers differ by 1.1 m two seconds before T0. Along the longest axis the interval is 1.9 m;
+    # it was 2.7 m with the former 1 m^2/s^3 of acceleration.
     starts, _, passes = labelled
     for (start, _), one in zip(starts, passes, strict=True):
         stated_m = np.interp(t0_s(start, 5.0) - 2.0, one.track.time_s, one.track.position_std_m)
@@ -99,7 +99,7 @@ except MissingExtraError as error:
             assert math.hypot(x - LANE_M, y - side * (20.0 - 5.0 * (hidden_s - start))) < 2.0
 
 
-def test_who_drives_ahead_or_stands_comes_out_of_no_arm():
+def test_vehicles_ahead_or_standing_have_no_arm():
     box = np.array([[900.0, 550.0, 1050.0, 750.0]])
     frames = [
         DetectionFrame(box + 2.0 * image * np.array([-1, -1, 1, 1]), np.ones(1), ("car",))
@@ -110,8 +110,8 @@ def test_who_drives_ahead_or_stands_comes_out_of_no_arm():
     assert label_passes(tracks) == []
 
 
-def test_who_overtakes_and_drives_away_comes_out_of_no_arm():
-    # Beside the ego at first, 3 m to the left of it, then back in its lane and 30 m ahead.
+def test_overtaking_vehicles_have_no_arm():
+    # First beside the ego, 3 m to the left, then back in its lane and 30 m ahead.
     ahead_m, left_m = np.linspace(6.0, 30.0, 24), np.linspace(3.0, -0.5, 24)
     time_s, edges = np.arange(24) / 10.0, (left_m + np.array([[0.9], [-0.9]])) / ahead_m
     overtaking = BoxTrack(time_s, *np.arctan(edges), 1.55 / ahead_m, "car")
@@ -120,7 +120,7 @@ def test_who_overtakes_and_drives_away_comes_out_of_no_arm():
     assert label_passes([overtaking]) == []
 
 
-def test_nobody_is_about_to_be_seen_after_an_empty_window():
+def test_no_vehicle_appears_soon_after_an_empty_window():
     time_s = np.arange(10, 600) / 10.0
     seen = (time_s >= 24.0) & (time_s <= 27.0)
     ends = [row[5] for row in window_rows([], seen, time_s, "Sown", "street.wav")]
@@ -128,7 +128,7 @@ def test_nobody_is_about_to_be_seen_after_an_empty_window():
     assert all(end_s + 5.0 < 24.0 or end_s - 3.0 > 26.9 for end_s in ends)
 
 
-def test_open_label_holds_every_pass_with_its_hidden_phase(labelled):
+def test_openlabel_has_every_pass_with_its_hidden_phase(labelled):
     _, _, passes = labelled
     document = json.loads(json.dumps(open_label("street.wav", passes), allow_nan=False))["openlabel"]
     assert [one["type"] for one in document["objects"].values()] == ["car"] * 3
@@ -143,7 +143,7 @@ def test_open_label_holds_every_pass_with_its_hidden_phase(labelled):
     assert sights.count(False) > 30
 
 
-def test_windows_leave_out_two_at_once_and_busy_seconds(labelled):
+def test_windows_exclude_two_vehicles_and_busy_seconds(labelled):
     starts, tracks, passes = labelled
     time_s = np.arange(10, 420) / 10.0
     seen = np.any([(time_s >= one.time_s[0]) & (time_s <= one.time_s[-1]) for one in tracks], axis=0)
@@ -151,7 +151,7 @@ def test_windows_leave_out_two_at_once_and_busy_seconds(labelled):
     by_class = {
         label: [row[5] for row in rows if row[1] == label] for label in ("left", "right", "front", "none")
     }
-    # The first two come half a second apart: neither is a clean window.
+    # The first two are half a second apart, so neither gives a clean window.
     assert by_class["right"] == []
     assert by_class["left"] == [pytest.approx(t0_s(starts[2][0], 5.0), abs=0.15)]
     assert len(by_class["front"]) == 1
@@ -160,7 +160,7 @@ def test_windows_leave_out_two_at_once_and_busy_seconds(labelled):
     assert by_class["none"]
 
 
-def test_the_true_track_of_a_pass_is_drawn_while_it_lasts(labelled):
+def test_the_true_track_is_drawn_for_the_time_of_the_pass(labelled):
     starts, _, passes = labelled
     time_s = np.arange(0.0, 40.0, 0.1)
     places = np.stack([np.full(400, LANE_M), 20.0 - 5.0 * (time_s - starts[2][0])], axis=1)
@@ -181,7 +181,7 @@ def test_a_list_of_labels_is_beside_or_above_its_recording(tmp_path):
 
 @pytest.fixture
 def recording(tmp_path):
-    """A silent recording with boxes of two passes beside it, and what the command is given."""
+    """Write a silent recording with boxes of two passes; return the options of the command."""
     import soundfile
 
     rng = np.random.default_rng(1)
@@ -214,7 +214,7 @@ def test_the_command_labels_a_recording(recording, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_train_learns_what_was_labelled(recording, tmp_path, capsys):
+def test_training_reads_the_labels(recording, tmp_path, capsys):
     windows, table, model = (tmp_path / name for name in ("labels.csv", "table.csv", "model.json"))
     assert main([*recording, "--out", str(tmp_path / "labels.json"), "--windows", str(windows)]) == 0
     rng, labels = np.random.default_rng(2), np.tile(["left", "right", "none", "front"], 15)

@@ -1,4 +1,4 @@
-"""The page of a run that goes on: what it is sent, whom it is sent to, and what a browser shows of it."""
+"""The page of a live run: messages, viewers and a browser."""
 
 import json
 import socket
@@ -36,7 +36,7 @@ def states():
 
 
 def hop(state, **more):
-    """Return a hop as the loop of `live` has it, whose camera has found two boxes."""
+    """Return a hop of `live` with two boxes of a camera."""
     looks = (CameraLook(Look("camera", state.stamp_ns, Absent(0.1)), BOXES),)
     step = SimpleNamespace(state=state, measurement=SimpleNamespace(looks=looks))
     return SimpleNamespace(**{"step": step, "latency_s": 0.04, "overruns": 0, "lost_s": 0.0} | more)
@@ -47,7 +47,7 @@ def address(page):
 
 
 class Viewer(threading.Thread):
-    """Reads what it is sent until the run ends."""
+    """Reads messages until the run ends."""
 
     def __init__(self, page):
         super().__init__()
@@ -72,13 +72,13 @@ def until(holds):
         time.sleep(0.01)
 
 
-def test_each_viewer_is_sent_every_hop_once_whenever_it_comes(states):
+def test_each_viewer_receives_every_hop_once(states):
     with LivePage(0) as page:
         viewers = [Viewer(page)]
         for state in states[:3]:
             page.show(hop(state))
         viewers.append(Viewer(page))
-        until(lambda: len(viewers[1].rows) == 3)  # what was before it comes at once
+        until(lambda: len(viewers[1].rows) == 3)  # earlier states come at once
         for state in states[3:]:
             page.show(hop(state))
     for viewer in viewers:
@@ -86,7 +86,7 @@ def test_each_viewer_is_sent_every_hop_once_whenever_it_comes(states):
         assert [row["t"] for row in viewer.rows] == pytest.approx([one.stamp_ns / 1e9 for one in states])
 
 
-def test_a_viewer_that_comes_late_is_sent_the_last_minute(states, monkeypatch):
+def test_a_late_viewer_receives_the_last_minute(states, monkeypatch):
     monkeypatch.setattr(live_page, "MOST_ROWS", 4)
     with LivePage(0) as page:
         for k in range(9):
@@ -109,7 +109,7 @@ def test_other_origins_receive_no_states(states):
             urlopen(page.url + "states.jsonl")
 
 
-def test_a_viewer_that_takes_nothing_holds_up_neither_a_hop_nor_the_end(states, monkeypatch):
+def test_a_stalled_viewer_delays_neither_hops_nor_the_end(states, monkeypatch):
     monkeypatch.setattr(live_page, "_PATIENCE_S", 1.0)
     monkeypatch.setattr(live_page, "MOST_ROWS", 5000)
     with LivePage(0) as page:
@@ -128,7 +128,7 @@ def test_a_viewer_that_takes_nothing_holds_up_neither_a_hop_nor_the_end(states, 
     stalled.close()
 
 
-def test_one_viewer_too_many_is_sent_nothing(states, monkeypatch):
+def test_viewers_beyond_the_limit_receive_nothing(states, monkeypatch):
     monkeypatch.setattr(live_page, "MOST_VIEWERS", 1)
     with LivePage(0) as page:
         page.show(hop(states[0]))
@@ -141,7 +141,7 @@ def test_one_viewer_too_many_is_sent_nothing(states, monkeypatch):
     first.join()
 
 
-def test_the_command_serves_the_states_that_it_writes(street, tmp_path, monkeypatch, capsys):
+def test_the_page_of_live_has_the_written_states(street, tmp_path, monkeypatch, capsys):
     viewers = []
 
     class Watched(LivePage):
@@ -163,7 +163,7 @@ def test_the_command_serves_the_states_that_it_writes(street, tmp_path, monkeypa
     assert all(row["live"]["latency_s"] >= 0.0 for row in got)
 
 
-def test_a_taken_port_and_a_missing_package_are_named_before_the_run(street, capsys, monkeypatch):
+def test_a_taken_port_and_a_missing_package_raise_an_error_before_the_run(street, capsys, monkeypatch):
     play = "--play", str(street / "street.wav"), "--array", str(street / "mics.csv"), "--uncalibrated"
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
@@ -178,7 +178,7 @@ STATED = scripted_states()
 
 
 @given(st.sampled_from(STATED), st.booleans(), st.lists(st.sampled_from(sorted(WHY_NOT)), unique=True))
-def test_a_sentence_names_every_advisory_and_every_reason_against_it(state, advised, reasons):
+def test_the_sentence_has_every_advisory_and_reason(state, advised, reasons):
     cues = tuple(
         replace(one, usable=not reasons, why_not=tuple(reasons), advisory=one.advisory if advised else None)
         for one in state.cues
@@ -192,7 +192,7 @@ def test_a_sentence_names_every_advisory_and_every_reason_against_it(state, advi
     assert ("Do not act on it" in said) == bool(reasons)
 
 
-def test_without_a_model_the_sentence_states_no_risk(states):
+def test_without_a_model_the_sentence_has_no_risk(states):
     cue = replace(states[-1].cues[0], direction=None, risk=None, advisory=None, within=None, evidence=None)
     bearing = SimpleNamespace(azimuth_rad=-0.5)
     said = headline(replace(states[-1], cues=(cue,), bearing=bearing))
@@ -241,12 +241,12 @@ def test_a_browser_shows_the_run_without_an_error(states, tmp_path):
         )
         assert boxes == ["car 0.90", "</script><b> 0.50, parked"]
         assert "camera: 2 boxes" in seen.value("at('cameras').textContent")
-        # The view to the left stands on the left.
+        # The view to the left is on the left.
         lefts = seen.value(
             "[...document.querySelectorAll('#cameras rect')].slice(1).map(one => +one.getAttribute('x'))"
         )
         assert lefts[0] < lefts[1]
-        # Who looks back is left there while hops go on, until the page is to follow again.
+        # The selected time stays while hops continue, until the page follows again.
         seen.press("Home")
         page.show(hop(replace(states[-1], stamp_ns=states[-1].stamp_ns + 2 * 10**8)))
         seen.until(f"rows.length === {len(states) + 5}")
@@ -259,7 +259,7 @@ def test_a_browser_shows_the_run_without_an_error(states, tmp_path):
 
 @pytest.mark.long
 @needs_browser
-def test_a_browser_states_that_the_run_has_ended(tmp_path):
+def test_a_browser_shows_the_end_of_the_run(tmp_path):
     with browser(tmp_path / "profile") as seen:
         with LivePage(0) as page:
             seen.open(page.url)

@@ -1,4 +1,4 @@
-"""A log as one page: it says what the states say, stands alone, and opens in a browser without a fault."""
+"""A log as one page: content, independence of other files and display in a browser."""
 
 import base64
 import io
@@ -26,7 +26,7 @@ from worldstate.operations.viewing.log_page import page_data, write_log_page
 
 TIME_S = 0.1 * np.arange(40)
 TRUE = TrueTrack(TIME_S, 0.02 * np.arange(40), TIME_S > 2.0, np.zeros((40, 2)))
-# Two images of a pixel, black and white.
+# Two images of one pixel, black and white.
 JPEGS = [cv2.imencode(".jpg", np.full((1, 1), grey, np.uint8))[1].tobytes() for grey in (0, 255)]
 HOSTILE = "</script><script src='https://example.org/x.js'></script><!--"
 
@@ -37,7 +37,7 @@ def states():
 
 
 class Elements(HTMLParser):
-    """The elements of a page, and the text of its data."""
+    """Collects the elements of a page and the text of its data."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ def written(states, tmp_path, **parts):
     return (tmp_path / "log.html").read_text("utf-8")
 
 
-def test_the_page_holds_what_the_states_say(states, tmp_path):
+def test_the_page_has_the_values_of_the_states(states, tmp_path):
     rows = json.loads(Elements(written(states, tmp_path)).data)["states"]
     assert [row["t"] for row in rows] == [pytest.approx(one.stamp_ns / 1e9, abs=1e-3) for one in states]
     for row, state in zip(rows, states, strict=True):
@@ -83,7 +83,7 @@ def test_the_page_holds_what_the_states_say(states, tmp_path):
     assert rows[-1]["entities"][0]["place"] == [8.0, 4.4]
 
 
-def test_nothing_in_a_log_becomes_a_part_of_the_page(states, tmp_path):
+def test_text_of_a_log_is_escaped(states, tmp_path):
     plain = Elements(written(states, tmp_path))
     named = [replace(state, entities=(replace(state.entities[0], id=HOSTILE),)) for state in states]
     hostile = Elements(written(named, tmp_path, title=HOSTILE))
@@ -91,7 +91,7 @@ def test_nothing_in_a_log_becomes_a_part_of_the_page(states, tmp_path):
     assert json.loads(hostile.data)["title"] == HOSTILE
 
 
-def test_the_page_asks_for_nothing_outside_itself(states, tmp_path):
+def test_the_page_has_no_external_requests(states, tmp_path):
     page = written(states, tmp_path)
     links = [one[key] for _, one in Elements(page).found for key in ("src", "href") if key in one]
     assert links == ["data:,"]
@@ -100,7 +100,7 @@ def test_the_page_asks_for_nothing_outside_itself(states, tmp_path):
     assert policy.startswith("default-src 'none';")
 
 
-def test_what_was_run_uncalibrated_says_so_and_has_no_threshold(states):
+def test_an_uncalibrated_run_is_marked_and_has_no_threshold(states):
     data = page_data(replace(state, calibrated=False) for state in states)
     assert "Not calibrated" in data["remarks"][0]
     assert not any(row["thresholds"] for row in data["states"])
@@ -110,7 +110,7 @@ def test_what_was_run_uncalibrated_says_so_and_has_no_threshold(states):
     assert page_data(states)["remarks"] == []
 
 
-def test_a_long_log_is_thinned_evenly_and_says_so(states, monkeypatch):
+def test_a_long_log_is_thinned_with_a_note(states, monkeypatch):
     monkeypatch.setattr(log_page, "MOST_STATES", 10)
     many = [replace(states[0], stamp_ns=10**8 * k) for k in range(90)]
     data = page_data(many)
@@ -118,13 +118,13 @@ def test_a_long_log_is_thinned_evenly_and_says_so(states, monkeypatch):
     assert "One of 8 snapshots is shown of 90" in data["remarks"][-1]
 
 
-def test_the_colours_are_those_of_the_figures(states, tmp_path):
+def test_page_and_figures_have_the_same_colours(states, tmp_path):
     light = dict(re.findall(r"--(\w+): (#\w+);", written(states, tmp_path).split("prefers-color-scheme")[0]))
     for name in ("HIDDEN", "IN_VIEW", "SEARCHED", "HEARD", "DECISION"):
         assert light[name.lower().removeprefix("in_")] == getattr(figure_style, name).lower()
 
 
-def test_the_command_writes_a_part_of_a_log_beside_it(states, tmp_path, capsys):
+def test_the_view_command_writes_a_part_of_a_log(states, tmp_path, capsys):
     log = tmp_path / "states.jsonl"
     log.write_text("".join(state.to_json() + "\n" for state in states))
     assert main(["log", "view", str(log), "--between", "0.25", "0.45", "--json"]) == 0
@@ -137,7 +137,7 @@ def test_the_command_writes_a_part_of_a_log_beside_it(states, tmp_path, capsys):
 
 
 def logged_sound(samples, rate_hz, begins_ns=0):
-    """Return what a log holds of sound in [-1, 1): blocks of a tenth of a second, each with its stamp."""
+    """Return logged sound in [-1, 1): blocks of 0.1 s with their stamps."""
     size = rate_hz // 10
     stamps_ns = [begins_ns + round(k * size * 1e9 / rate_hz) for k in range(-(-len(samples) // size))]
     blocks = np.split(samples, range(size, len(samples), size))
@@ -147,7 +147,7 @@ def logged_sound(samples, rate_hz, begins_ns=0):
 
 
 def logged_images(stamps_ns):
-    """Return what a log holds of images, each with bytes of its own."""
+    """Return logged images, each with its own bytes."""
     return [(at, image_message(at, b"\xff\xd8\xff" + str(at).encode()).value) for at in stamps_ns]
 
 
@@ -158,7 +158,7 @@ def of_uri(uri, kind):
 
 
 def of_wave(uri):
-    """Return rate and samples of the page's sound, by the reader of the standard library."""
+    """Return rate and samples of the page's sound by the standard library."""
     with wave.open(io.BytesIO(of_uri(uri, "audio/wav"))) as sound:
         assert (sound.getnchannels(), sound.getsampwidth()) == (1, 2)
         return sound.getframerate(), np.frombuffer(sound.readframes(sound.getnframes()), "<i2")
@@ -166,7 +166,7 @@ def of_wave(uri):
 
 @pytest.mark.parametrize("since_ns", [0, 1_700_000_000 * 10**9 + 7])
 @pytest.mark.parametrize("rate_hz", [8000, 15_999, 11_025])
-def test_the_sound_of_the_page_is_that_of_the_log_from_the_first_snapshot_on(states, since_ns, rate_hz):
+def test_the_sound_of_the_page_starts_at_the_first_snapshot(states, since_ns, rate_hz):
     noise = np.random.default_rng(0).uniform(-1.0, 1.0, 2 * rate_hz).astype(np.float32)
     later = [replace(state, stamp_ns=state.stamp_ns + since_ns) for state in states]
     got_hz, got = of_wave(page_data(later, media=logged_sound(noise, rate_hz, since_ns))["sound"])
@@ -179,7 +179,7 @@ def test_the_sound_of_the_page_is_that_of_the_log_from_the_first_snapshot_on(sta
     )
 
 
-def test_sound_of_a_high_rate_is_resampled_and_what_the_log_lacks_is_silent(states):
+def test_sound_is_resampled_and_gaps_are_silent(states):
     time_s = np.arange(48_000) / 48_000
     both = 0.4 * np.sin(2 * np.pi * 1000 * time_s) + 0.4 * np.sin(2 * np.pi * 12_000 * time_s)
     blocks = logged_sound(both.astype(np.float32), 48_000)
@@ -193,7 +193,7 @@ def test_sound_of_a_high_rate_is_resampled_and_what_the_log_lacks_is_silent(stat
     assert np.abs(lost).max() < 0.01
 
 
-def test_a_long_sound_is_cut_and_says_so(states, monkeypatch):
+def test_a_long_sound_is_cut_with_a_note(states, monkeypatch):
     blocks = logged_sound(np.full(8000, 0.5, np.float32), 8000)
     assert page_data(states, media=blocks)["remarks"] == []
     monkeypatch.setattr(log_page, "MOST_SOUND_S", 0.2)
@@ -239,7 +239,7 @@ def test_the_image_of_a_snapshot_is_the_last_one_at_or_before_it(states):
 
 
 @pytest.mark.parametrize("bound", [{"MOST_IMAGES": 20}, {"MOST_CHARACTERS": 1000}])
-def test_many_images_are_thinned_evenly_and_the_page_says_so(states, monkeypatch, bound):
+def test_many_images_are_thinned_with_a_note(states, monkeypatch, bound):
     for name, value in bound.items():
         monkeypatch.setattr(log_page, name, value)
     many = [replace(states[0], stamp_ns=10**8 * k) for k in range(90)]
@@ -252,7 +252,7 @@ def test_many_images_are_thinned_evenly_and_the_page_says_so(states, monkeypatch
     assert data["states"][-1]["image"] == len(times) - 1
 
 
-def test_an_image_larger_than_the_page_is_left_out(states, monkeypatch):
+def test_images_larger_than_the_page_are_omitted(states, monkeypatch):
     monkeypatch.setattr(log_page, "MOST_CHARACTERS", 10)
     data = page_data(states, media=logged_images([0, states[1].stamp_ns]))
     assert "images" not in data
@@ -261,7 +261,7 @@ def test_an_image_larger_than_the_page_is_left_out(states, monkeypatch):
 
 @pytest.fixture
 def log_with_media(states, tmp_path):
-    """An MCAP file of the states, of noise at 16 kHz and of an image a state, as a run writes them."""
+    """Write an MCAP file of states, noise at 16 kHz and one image per state."""
     noise = np.random.default_rng(0).uniform(-0.5, 0.5, 16_000).astype(np.float32)
     with mcap_file(tmp_path / "log.mcap") as write:
         for at_ns, _ in logged_sound(noise, 16_000):
@@ -274,7 +274,7 @@ def log_with_media(states, tmp_path):
     return tmp_path / "log.mcap", noise
 
 
-def test_the_command_shows_images_and_sound_of_a_log_that_holds_them(states, log_with_media, tmp_path):
+def test_the_view_command_shows_images_and_sound_of_a_log(states, log_with_media, tmp_path):
     log, noise = log_with_media
     assert main(["log", "view", str(log)]) == 0
     data = json.loads(Elements(log.with_suffix(".html").read_text("utf-8")).data)
@@ -292,7 +292,7 @@ def test_the_command_shows_images_and_sound_of_a_log_that_holds_them(states, log
     assert not any("image" in row for row in json.loads(plain.data)["states"])
 
 
-def test_a_log_is_read_once_for_its_snapshots_and_once_for_images_and_sound(log_with_media, monkeypatch):
+def test_a_log_is_read_at_most_twice(log_with_media, monkeypatch):
     from mcap import reader
 
     log, readings = log_with_media[0], []
@@ -307,7 +307,7 @@ def test_a_log_is_read_once_for_its_snapshots_and_once_for_images_and_sound(log_
     assert len(readings) == 2
 
 
-def test_media_that_is_no_base64_is_refused_in_one_line(states, tmp_path, capsys):
+def test_media_that_is_no_base64_gives_one_line(states, tmp_path, capsys):
     log, message = tmp_path / "log.mcap", image_message(0, b"image")
     with mcap_file(log) as write:
         for one in (*state_messages(states[0]), replace(message, value=replace(message.value, data='"><x'))):
@@ -318,7 +318,7 @@ def test_media_that_is_no_base64_is_refused_in_one_line(states, tmp_path, capsys
 
 @pytest.mark.long
 @needs_browser
-def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states, tmp_path):
+def test_the_page_explains_decisions_cuts_and_unusable_sound(states, tmp_path):
     heard = [replace(one, bearing=None if k == 2 else Bearing(0.3, 0.1, 2.0)) for k, one in enumerate(states)]
     low = replace(states[0].cues[0], evidence=replace(states[0].cues[0].evidence, compared_nats=-20.0))
     shown = [replace(heard[0], cues=(low, *heard[0].cues[1:])), *heard[1:]]
@@ -358,7 +358,7 @@ def test_a_newcomer_finds_what_decides_what_is_cut_and_what_was_not_heard(states
 @pytest.mark.long
 @needs_browser
 @pytest.mark.parametrize("width", [1300, 420])
-def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_path, width):
+def test_a_browser_opens_the_page_without_errors_or_requests(states, tmp_path, width):
     since_1970 = [replace(state, stamp_ns=state.stamp_ns + 1_700_000_000 * 10**9) for state in states]
     pages = {
         "whole": (states, {"truth": (TRUE,), "t0_s": 0.4, "title": HOSTILE}),
@@ -404,7 +404,7 @@ def test_a_browser_opens_it_without_an_error_and_without_a_request(states, tmp_p
 
 @pytest.mark.long
 @needs_browser
-def test_the_sound_plays_in_step_with_the_slider_and_the_image(states, log_with_media, tmp_path):
+def test_sound_slider_and_image_are_synchronous(states, log_with_media, tmp_path):
     log, _ = log_with_media
     assert main(["log", "view", str(log)]) == 0
     path = log.with_suffix(".html")
@@ -424,7 +424,7 @@ def test_the_sound_plays_in_step_with_the_slider_and_the_image(states, log_with_
             "slider.value = 2; slider.dispatchEvent(new Event('input'))".replace("slider", "at('slider')")
         )
         assert page.value(held) == [pytest.approx(0.2, abs=1e-4), 2]
-        # Slower than the clock, it sets the pace: it would else be paused halfway.
+        # Slower than the clock, it sets the pace, otherwise it would be paused halfway.
         page.value("document.querySelector('audio').playbackRate = 0.5")
         space = "document.body.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))"
         page.call("Runtime.evaluate", expression=space, userGesture=True)

@@ -137,10 +137,7 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "ensemble of too many experts": (signature(experts=read_model().signature.experts * 20), "experts"),
     "ensemble with a short reference": (signature(home=read_model().signature.home[:-6]), "home"),
-    "expert of an unknown view": (
-        lambda: replace(read_model().signature.experts[0], view="colour"),
-        "view",
-    ),
+    "expert of an unknown view": (lambda: replace(read_model().signature.experts[0], view="colour"), "view"),
     "window of 59 features": (window(np.zeros((3, 59))), "X"),
     "window without a row": (window(np.zeros(60)), "X"),
     "window that is no number": (window(np.full((1, 60), np.nan)), "X"),

@@ -1,4 +1,4 @@
-"""Arguments that adapters refuse, one row for each. Damaged files have tests of their own."""
+"""Errors of adapters for wrong arguments: one row per error. Damaged files have their own tests."""
 
 import io
 import math
@@ -19,9 +19,12 @@ from worldstate.adapters.camera.camera_health import (
 )
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.listener import listen_steps
+from worldstate.adapters.live.live_sensors import DetectionSocket
+from worldstate.adapters.live.live_sound import BoundedChannel
 from worldstate.adapters.source import open_source
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import WorldstateError
+from worldstate.ground.values import nanoseconds
 
 EMPTY, GREY = DetectionFrame(np.empty((0, 4)), np.empty(0), ()), np.full((40, 60, 3), 90, np.uint8)
 RNG = np.random.default_rng(0)
@@ -77,6 +80,11 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "look without an image": (look(0, None), "look: expected a DetectionFrame"),
     "measurement of None": (lambda: Listener(ovad_array(), 48_000).add(None), "add: expected Measurement"),
     "forgetting time of zero": (lambda: ListenSettings(forgetting_s=0.0), "forgetting_s"),
+    "channel of no items": (lambda: BoundedChannel(0), "capacity"),
+    **{
+        f"address {one}": (lambda one=one: DetectionSocket(one, nanoseconds), "expected HOST:PORT")
+        for one in ("9100", "127.0.0.1:x", "127.0.0.1:70000")
+    },
     **{
         f"sound at {rate} Hz": (heard_at(rate), f"at least 6000 Hz, got {rate} Hz") for rate in (3_000, 5_800)
     },

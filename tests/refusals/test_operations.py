@@ -36,7 +36,7 @@ def _smooth(*updates: dict) -> None:
 
 
 REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
-    "bearing bound of one microphone": (lambda: bearing_crb_rad2(POLE[:1], 0.0, 1e3, 1.0, 1), "2 microphones"),
+    "bearing of one microphone": (lambda: bearing_crb_rad2(POLE[:1], 0.0, 1e3, 1.0, 1), "2 microphones"),
     "bearing bound with a negative SNR": (lambda: bearing_crb_rad2(np.eye(3), 0.0, 1e3, -1.0, 1), "snr"),
     "bearing bound without an azimuth": (lambda: bearing_crb_rad2(np.eye(3), np.nan, 1e3, 1.0, 1), "azimuth"),
     "tone bound without a signal": (lambda: tone_crb_hz2(0.0, 100, 1e3), "snr"),

@@ -1,4 +1,4 @@
-"""Bags of ROS 2: what is written is read by other programs, what is read is a recording like any other."""
+"""Bags of ROS 2: written ones in other readers, and read ones as recordings."""
 
 import json
 import logging
@@ -47,7 +47,7 @@ def block(samples: np.ndarray, stamp_ns: int, **changed: object) -> dict[str, ob
 
 
 def write_blocks(path: Path, samples: np.ndarray, *, lost: tuple[int, ...] = (), **changed: object) -> Path:
-    """Write a second in blocks of .1 s, from 5 s on."""
+    """Write sound in blocks of 0.1 s from 5 s on."""
     with bag_writer(path) as write:
         for k, start in enumerate(range(0, len(samples), RATE_HZ // 10)):
             if k not in lost:
@@ -59,7 +59,7 @@ def write_blocks(path: Path, samples: np.ndarray, *, lost: tuple[int, ...] = (),
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])
 def written(request, tmp_path_factory):
-    """States as a bag, in either storage."""
+    """Write states as a bag in each storage."""
     path = tmp_path_factory.mktemp("bag") / "states"
     with state_bag(path, 7.0, request.param) as write:
         for state in STATES:
@@ -68,7 +68,7 @@ def written(request, tmp_path_factory):
 
 
 def read_by_others(path: Path) -> list[tuple[str, int, object]]:
-    """Return topic, time and message of a bag: MCAP by Foxglove's own reader, SQLite by rosbags'."""
+    """Return topic, time and message of a bag by Foxglove's MCAP reader or the SQLite reader of rosbags."""
     (storage,) = (file for file in path.iterdir() if file.suffix != ".yaml")
     if storage.suffix == ".mcap":
         from mcap.reader import make_reader
@@ -83,7 +83,7 @@ def read_by_others(path: Path) -> list[tuple[str, int, object]]:
         return [(one.topic, time, bag.deserialize(data, one.msgtype)) for one, time, data in bag.messages()]
 
 
-def test_other_readers_find_what_the_states_say(written):
+def test_other_readers_find_the_values_of_the_states(written):
     read = read_by_others(written)
     planners = "/perception/object_recognition/objects"
     for topic in ("/worldstate/advisories", planners, "/worldstate/markers"):
@@ -123,7 +123,7 @@ def test_objects_in_the_bag_are_those_of_autoware(written):
             assert len(one.kinematics.predicted_paths[0].path) == 7
 
 
-def test_markers_draw_the_scene_and_nothing_of_the_one_before(written):
+def test_markers_replace_those_of_the_last_scene(written):
     for _, _, message in (one for one in read_by_others(written) if one[0].endswith("markers")):
         first, *drawn = message.markers
         assert first.action == 3, "all that was there goes"
@@ -137,7 +137,7 @@ def test_markers_draw_the_scene_and_nothing_of_the_one_before(written):
     )
 
 
-def test_replay_gives_back_what_was_written_from_the_folder_and_from_its_file(written, tmp_path, capsys):
+def test_replay_of_folder_and_file_gives_the_written_states(written, tmp_path, capsys):
     (storage,) = (file for file in written.iterdir() if file.suffix != ".yaml")
     for log in (written, storage):
         assert main(["log", "replay", str(log), "--out", str(tmp_path / "states.jsonl")]) == 0
@@ -148,8 +148,8 @@ def test_replay_gives_back_what_was_written_from_the_folder_and_from_its_file(wr
     assert "expected snapshots, got none" in capsys.readouterr().err
 
 
-def test_a_message_is_laid_out_as_cdr_says(tmp_path):
-    """Parsed by hand: a header of four bytes, little endian, each value at a multiple of its size."""
+def test_messages_have_the_layout_of_cdr(tmp_path):
+    """Parsed by hand: header of 4 bytes, little endian, values at multiples of their size."""
     samples = sound_of(3)
     with bag_writer(tmp_path / "one", "sqlite3") as write:
         write("/mics", AUDIO, 1_500_000_000, block(samples, 1_500_000_000))
@@ -178,8 +178,8 @@ def bag_of_approach(approach, tmp_path_factory):
     return path
 
 
-def test_the_bag_of_a_recording_says_where_array_and_camera_stand(bag_of_approach):
-    """The chain of frames ends at `base_link`; SciPy's rotations are the oracle of the camera's axis."""
+def test_the_bag_of_a_recording_has_the_frames_of_array_and_camera(bag_of_approach):
+    """The chain of frames ends at `base_link`; rotations of SciPy are the oracle."""
     read = read_by_others(bag_of_approach)
     ((_, stamp_ns, told),) = (one for one in read if one[0] == "/tf_static")
     assert stamp_ns == min(time for _, time, _ in read), "before all that stands in these frames"
@@ -198,7 +198,7 @@ def test_the_bag_of_a_recording_says_where_array_and_camera_stand(bag_of_approac
     up = camera.pitch_rad
     assert turn.apply([1.0, 0.0, 0.0]) == pytest.approx([math.cos(up), 0.0, math.sin(up)])
     assert turn.apply([0.0, 1.0, 0.0]) == pytest.approx([0.0, 1.0, 0.0])
-    # 1 is TRANSIENT_LOCAL: otherwise a player sends the one message to those alone that listen already.
+    # 1 is TRANSIENT_LOCAL, without which a player sends the one message only to existing subscribers.
     assert (bag_of_approach / "metadata.yaml").read_text().count("durability: 1") == 1
 
 
@@ -218,8 +218,8 @@ def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach,
             cue["advisory"] is None for cue in other["cues"]
         ]
         for cue, as_before in zip(one["cues"], other["cues"], strict=True):
-            # Seconds since 1970 hold 240 ns, in which a belief that is carried changes by up to one a second,
-            # and what was learned of the traffic, which is told in steps, may take its next one.
+            # Seconds since 1970 have a resolution of 240 ns, in which a belief changes by at most 1 per s,
+            # and the learned traffic, which is published in steps, may take its next step.
             assert cue["risk"] == pytest.approx(as_before["risk"], abs=1e-4)
         assert [one["status"] for one in one["entities"]] == [one["status"] for one in other["entities"]]
     # The bag has no pose in the map, without which there are no objects for a planner.
@@ -229,7 +229,7 @@ def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach,
     assert replayed.read_bytes() == again.read_bytes()
 
 
-def test_other_commands_hear_a_bag_by_its_own_array(bag_of_approach, tmp_path, capsys):
+def test_other_commands_use_the_array_of_a_bag(bag_of_approach, tmp_path, capsys):
     assert main(["array", "bearings", str(bag_of_approach), "--out", str(tmp_path / "b.csv"), "--json"]) == 0
     assert "56 microphones" in capsys.readouterr().out
     assert len((tmp_path / "b.csv").read_text().splitlines()) > 50
@@ -249,7 +249,7 @@ def test_the_camera_of_a_bag_labels_its_street(approach, bag_of_approach, tmp_pa
     assert "--windows: expected none for a bag" in capsys.readouterr().err
 
 
-def test_sound_comes_back_sample_for_sample_in_either_layout(tmp_path):
+def test_sound_of_both_layouts_reads_back_exactly(tmp_path):
     samples = sound_of(9600)
     write_blocks(tmp_path / "interleaved", samples)
     with bag_writer(tmp_path / "planar", "sqlite3") as write:
@@ -266,7 +266,7 @@ def test_sound_comes_back_sample_for_sample_in_either_layout(tmp_path):
         np.testing.assert_array_equal(np.concatenate(blocks), samples)
 
 
-def test_bytes_of_audio_common_are_read_as_its_info_says(tmp_path):
+def test_bytes_of_audio_common_are_read_by_their_info(tmp_path):
     whole = np.random.default_rng(1).integers(-(2**15), 2**15, (RATE_HZ * 2, 2), dtype=np.int16)
     info = {"channels": 2, "sample_rate": RATE_HZ, "sample_format": "S16LE", "coding_format": "wave"}
     for name, kind in (("stamped", "AudioDataStamped"), ("plain", "AudioData")):
@@ -284,7 +284,7 @@ def test_bytes_of_audio_common_are_read_as_its_info_says(tmp_path):
         np.testing.assert_array_equal(heard, whole.astype(np.float32) / 2**15)
 
 
-# As their packages define them, written here by rosbags alone.
+# As their packages define them, written by rosbags only.
 FOREIGN = {
     "audio_utils_msgs/msg/AudioFrame": """std_msgs/Header header
         string format
@@ -303,7 +303,7 @@ KINDS = {"signed_16": "<i2", "signed_24": "<i4", "signed_32": "<i4", "float": "<
 
 
 def foreign_bag(path: Path, samples: np.ndarray, said: str, *, lost: tuple[int, ...] = (), **changed) -> Path:
-    """Write samples of full scale 1 from 5 s on, in messages of .1 s, as another recorder would."""
+    """Write samples of full scale 1 from 5 s on in messages of 0.1 s as other recorders do."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -319,7 +319,7 @@ def foreign_bag(path: Path, samples: np.ndarray, said: str, *, lost: tuple[int, 
             if said == "signed_24":
                 data = np.frombuffer(data, np.uint8).reshape(-1, 4)[:, :3].tobytes()
             values = {"format": said, "data": np.frombuffer(data, np.uint8)}
-            tenths = 50 + k + (kind == FRAME)  # an AudioFrame is stamped when its last sample is there
+            tenths = 50 + k + (kind == FRAME)  # the stamp of an AudioFrame is that of its last sample
             stamp = time(sec=tenths // 10, nanosec=tenths % 10 * 100_000_000)
             if kind == FRAME:
                 values |= {"header": head(stamp=stamp, frame_id="mics"), "channel_count": part.shape[1]}
@@ -327,14 +327,14 @@ def foreign_bag(path: Path, samples: np.ndarray, said: str, *, lost: tuple[int, 
             else:
                 values |= {"timestamp": stamp, "sample_rate": RATE_HZ, "number_of_channels": part.shape[1]}
             if k not in lost:
-                # What changes begins with the third message.
+                # Changes begin with the third message.
                 message = store.types[kind](**(values | (changed if k > 2 else {})))
                 bag.write(to, tenths * 100_000_000, store.serialize_cdr(message, kind))
     return path
 
 
 @pytest.mark.parametrize("said", KINDS)
-def test_messages_that_describe_themselves_are_read_sample_for_sample(tmp_path, said):
+def test_self_describing_messages_are_read_exactly(tmp_path, said):
     samples = np.random.default_rng(2).integers(-(2**15), 2**15, (RATE_HZ * 2, CHANNELS)) / np.float32(2**15)
     sound = read_bag(foreign_bag(tmp_path / "bag", samples, said)).sound
     assert sound.start_ns == 5 * 10**9
@@ -343,7 +343,7 @@ def test_messages_that_describe_themselves_are_read_sample_for_sample(tmp_path, 
         np.testing.assert_array_equal(np.concatenate(list(audio.blocks())), samples)
 
 
-def test_sixteen_channels_of_another_recorder_run_as_our_own_sound_does(tmp_path, caplog):
+def test_sixteen_channels_of_another_recorder_give_the_same_states(tmp_path, caplog):
     noise = np.random.default_rng(5).integers(-9000, 9000, (3 * RATE_HZ, 16)) / np.float32(2**15)
     foreign_bag(tmp_path / "theirs", noise, "signed_16", lost=(12,))
     write_blocks(tmp_path / "ours", noise, lost=(12,))
@@ -383,8 +383,8 @@ poses = st.tuples(st.tuples(metres, metres, metres), st.tuples(angles, angles, a
 @pytest.mark.long
 @settings(max_examples=20)
 @given(st.lists(poses, min_size=1, max_size=4))
-def test_a_board_stands_where_the_static_transforms_put_it(chain):
-    """SciPy's rotations are the oracle; the transforms are written in the order of the last to the first."""
+def test_static_transforms_place_a_board(chain):
+    """Rotations of SciPy are the oracle; transforms are written from last to first."""
     frames, told = [*("base_link", "roof", "pole", "head")[: len(chain)], "mics"], []
     wanted = BOARD.positions_m.copy()
     for (parent, child), (at, turn) in reversed(list(zip(pairwise(frames), chain, strict=True))):
@@ -406,12 +406,12 @@ def test_a_board_stands_where_the_static_transforms_put_it(chain):
         ([("base_link", "mics", (1.0, 0.0, 0.0), QUARTER)], "/tf"),
     ],
 )
-def test_a_board_without_a_chain_of_static_transforms_is_as_it_was(transforms, topic, tmp_path, caplog):
+def test_a_board_without_static_transforms_is_not_moved(transforms, topic, tmp_path, caplog):
     sound = read_bag(board_bag(tmp_path / "bag", transforms, topic)).sound
     assert needed_array(sound, BOARD) is BOARD and not caplog.text
 
 
-def test_a_board_is_told_to_be_turned_and_an_array_file_stays(tmp_path, caplog, capsys):
+def test_turned_boards_are_reported_and_array_files_kept(tmp_path, caplog, capsys):
     bag = board_bag(tmp_path / "bag", [("base_link", "/mics", (1.0, 0.0, 1.5), QUARTER)])
     words = ["array", "bearings", str(bag), "--azimuth-span", "360", "--out", str(tmp_path / "b.csv")]
     assert main([*words, "--array", "respeaker-4"]) == 0
@@ -419,7 +419,7 @@ def test_a_board_is_told_to_be_turned_and_an_array_file_stays(tmp_path, caplog, 
         f"{bag}: respeaker-4 is turned and moved by /tf_static, its middle at (1, 0, 1.5) m"
     ]
     caplog.clear()
-    # A ring of four turned by a quarter is itself, by other channels; by an eighth it is another array.
+    # A ring of four turned by a quarter equals itself with other channels; by an eighth it does not.
     assert main(["run", str(bag), "--array", "respeaker-4"]) == 0
     assert "respeaker-4: its microphones are in another order" in caplog.text
     caplog.clear()
@@ -455,7 +455,7 @@ def test_a_board_is_told_to_be_turned_and_an_array_file_stays(tmp_path, caplog, 
         ),
     ],
 )
-def test_transforms_that_cannot_be_are_refused(transforms, problem, tmp_path):
+def test_wrong_transforms_raise_an_error(transforms, problem, tmp_path):
     sound = read_bag(board_bag(tmp_path / "bag", transforms)).sound
     with pytest.raises(InputFileError, match=re.escape(problem)):
         needed_array(sound, BOARD)
@@ -477,7 +477,7 @@ def test_transforms_that_cannot_be_are_refused(transforms, problem, tmp_path):
         ("pcm-s16", {"sample_rate": 16_000}, "expected 8000 Hz and 4 channels as in the first"),
     ],
 )
-def test_a_message_that_contradicts_itself_or_the_first_is_refused(tmp_path, said, changed, problem):
+def test_contradictory_messages_raise_an_error(tmp_path, said, changed, problem):
     path = foreign_bag(tmp_path / "bag", sound_of(RATE_HZ), said, **changed)
     with (
         pytest.raises(InputFileError, match=re.escape(problem)) as refused,
@@ -487,7 +487,7 @@ def test_a_message_that_contradicts_itself_or_the_first_is_refused(tmp_path, sai
     assert str(refused.value).startswith(str(path))
 
 
-def test_a_lost_message_is_silence_that_is_said_and_a_long_gap_is_refused(tmp_path, caplog):
+def test_a_lost_message_becomes_silence_and_a_long_gap_an_error(tmp_path, caplog):
     samples = sound_of(4 * RATE_HZ)
     gone = write_blocks(tmp_path / "one_lost", samples, lost=(20,))
     with caplog.at_level(logging.WARNING), open_sound(read_bag(gone).sound) as audio:
@@ -514,7 +514,7 @@ def box(left: float, top: float, width: float, height: float, label: str, score:
     }
 
 
-def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
+def test_detections_and_odometry_have_their_stamps(tmp_path):
     with bag_writer(tmp_path / "bag") as write:
         for k in range(3):
             stamp_ns = 3_000_000_000 + k * 500_000_000
@@ -539,7 +539,7 @@ def test_detections_and_odometry_are_read_with_their_stamps(tmp_path):
     assert held.array is None
 
 
-def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
+def test_states_have_the_speed_of_the_ego(tmp_path):
     from worldstate.adapters.listener import listen_steps
     from worldstate.adapters.source import ListenSettings, open_source
     from worldstate.frontend import MicrophoneArray
@@ -557,7 +557,7 @@ def test_the_speed_of_the_ego_stands_in_the_states(tmp_path):
     assert list(said.values()) == [2.0 * int(4 + 0.4 * k) for k in range(11)]
 
 
-def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
+def test_wrong_topics_raise_an_error_with_the_topics(tmp_path, capsys):
     samples = sound_of(2 * RATE_HZ)
     with bag_writer(tmp_path / "two") as write:
         for topic in ("/front", "/rear"):
@@ -600,7 +600,7 @@ def test_what_does_not_fit_is_refused_with_what_is_there(tmp_path, capsys):
         assert said in " ".join(capsys.readouterr().err.split()), (name, options)
 
 
-# Tenths of a second at which detections and odometry are stamped, None for not at all; all are recorded.
+# Tenths of a second of the stamps of detections and odometry, or None; all are recorded.
 STAMPED = {
     "as they were": lambda k: k,
     "not at all": lambda k: None,
@@ -613,7 +613,7 @@ STAMPED = {
 
 
 @pytest.mark.parametrize("name", STAMPED)
-def test_stamps_of_boxes_and_odometry_cost_nothing_that_was_sent(name, tmp_path, caplog):
+def test_bad_stamps_lose_no_boxes_or_odometry(name, tmp_path, caplog):
     begun_ns, tenth_ns = 3_000_000_000, 100_000_000
     with bag_writer(tmp_path / "bag") as write:
         for k in range(40):
@@ -635,7 +635,7 @@ def test_stamps_of_boxes_and_odometry_cost_nothing_that_was_sent(name, tmp_path,
     assert ("do not advance" in caplog.text) is (name in ("all alike", "ten alike"))
 
 
-def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
+def test_the_bag_of_a_drive_has_its_speed(tmp_path, capsys):
     folder = tmp_path / "DA1" / "left" / "1_00_0001"
     folder.mkdir(parents=True)
     noise = np.random.default_rng(0).uniform(-0.1, 0.1, (RATE_HZ, 56))
@@ -652,7 +652,7 @@ def test_the_bag_of_a_drive_holds_the_speed_that_was_driven(tmp_path, capsys):
     ]
 
 
-def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
+def test_a_log_of_snapshots_is_no_bag(tmp_path, capsys):
     states, log = tmp_path / "states.jsonl", tmp_path / "out.mcap"
     states.write_text("".join(state.to_json() + "\n" for state in STATES))
     assert main(["log", "replay", str(states), "--export", f"mcap={log}"]) == 0
@@ -663,7 +663,7 @@ def test_a_log_of_snapshots_is_told_from_a_bag(tmp_path, capsys):
 
 @pytest.mark.long
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3", "signed_16", "pcm-s16"])
-def test_a_damaged_bag_is_refused_by_name(tmp_path, storage):
+def test_a_damaged_bag_raises_an_error_with_its_name(tmp_path, storage):
     samples = sound_of(RATE_HZ)
     if storage in KINDS:
         foreign_bag(tmp_path / "whole", samples, storage)
@@ -692,7 +692,7 @@ def test_a_damaged_bag_is_refused_by_name(tmp_path, storage):
 
 
 @pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
-def test_a_bag_whose_reader_would_decode_without_a_bound_is_refused(tmp_path, mode):
+def test_compressed_bags_raise_an_error(tmp_path, mode):
     samples = sound_of(RATE_HZ)
     with bag_writer(tmp_path / "bag", "sqlite3") as write:
         for k in range(10):
@@ -706,7 +706,7 @@ def test_a_bag_whose_reader_would_decode_without_a_bound_is_refused(tmp_path, mo
 
 
 def indices_of(mcap: bytes) -> list[int]:
-    """Return where the index of each chunk begins, with its first and its last time."""
+    """Return the position of each chunk index, with its first and last time."""
     at, found = 8, []
     while at + 9 <= len(mcap):
         kind, length = struct.unpack_from("<BQ", mcap, at)
@@ -716,8 +716,8 @@ def indices_of(mcap: bytes) -> list[int]:
 
 
 @pytest.mark.parametrize(("first_ns", "last_ns"), [(1, 0), (0, -1), (-(10**18), -(10**18)), (2 * 10**9, 0)])
-def test_an_index_that_lies_about_the_times_of_its_messages_is_refused(tmp_path, first_ns, last_ns):
-    """By them a reader leaves messages out, and holds chunks together."""
+def test_a_wrong_index_of_an_mcap_raises_an_error(tmp_path, first_ns, last_ns):
+    """Readers omit and hold messages by these times."""
     with bag_writer(tmp_path / "bag") as write:
         for k in range(20):
             samples = np.random.default_rng(k).uniform(-0.5, 0.5, (40_000, CHANNELS)).astype(np.float32)
@@ -734,14 +734,14 @@ def test_an_index_that_lies_about_the_times_of_its_messages_is_refused(tmp_path,
         read_bag(file)
 
 
-def test_the_metadata_of_a_bag_are_parsed_once_more_in_all_than_by_its_reader(tmp_path, monkeypatch):
+def test_bag_metadata_is_parsed_once_more_than_by_rosbags(tmp_path, monkeypatch):
     from ruamel.yaml import YAML
 
     path, parsed, load = write_blocks(tmp_path / "bag", sound_of(RATE_HZ)), [], YAML.load
     monkeypatch.setattr(YAML, "load", lambda yaml, text: parsed.append(text) or load(yaml, text))
     with open_sound(read_bag(path).sound) as audio:
         assert sum(map(len, audio.blocks())) == RATE_HZ
-    opened = 4  # for the stamps of its sound, for what is beside it, for its first second, and for its blocks
+    opened = 4  # for the stamps of its sound, for the other topics, for its first second, and for its blocks
     assert len(parsed) == opened + 1
 
 

@@ -1,7 +1,7 @@
-"""The package of docs/examples for ROS 2, run against a stand-in of the calls of rclpy that it uses.
+"""The package of docs/examples for ROS 2, run with a stand-in for rclpy.
 
-Messages are made from the definitions that rosbags has of ROS 2, and what is published is written as CDR:
-a field that does not exist, or a value of another type, fails.
+Messages follow the definitions of rosbags, and published ones are written as CDR, so a field that does not
+exist and a value of another type raise an error.
 """
 
 import ast
@@ -34,7 +34,7 @@ LENS = {"width_px": 1936, "height_px": 1216, "horizontal_fov_deg": 68.75, "posit
 
 
 class Node:
-    """What is used of rclpy.node.Node."""
+    """Stand-in for rclpy.node.Node."""
 
     given = None
 
@@ -64,7 +64,7 @@ class Node:
 
 
 def message_class(kind):
-    """Return a class whose instances take values, as a message that `set_message_fields` fills."""
+    """Return a class of messages whose fields `set_message_fields` fills."""
     return type("Message", (), {"kind": kind, "values": None})
 
 
@@ -74,7 +74,7 @@ def set_message_fields(one, values):
 
 
 def check_fields(kind, values):
-    """Refuse a field that the type does not have, as the attributes of a message do."""
+    """Raise an error for a field that the type lacks."""
     known = dict(typestore().fielddefs[kind][1])
     for name, value in values.items():
         assert name in known, f"{kind} has no {name}"
@@ -88,7 +88,7 @@ def check_fields(kind, values):
 
 @pytest.fixture
 def node_of(monkeypatch):
-    """Return a function that makes the node with these parameters."""
+    """Return a function that makes the node with given parameters."""
     modules = {"rclpy": {"init": None, "spin": None, "try_shutdown": None}, "rclpy.node": {"Node": Node}}
     best = SimpleNamespace(BEST_AVAILABLE="best available")
     modules["rclpy.qos"] = {"QoSProfile": SimpleNamespace, "ReliabilityPolicy": best}
@@ -136,7 +136,7 @@ def moved_message(stamp_ns, speed_mps, frame="odom"):
 
 @pytest.fixture(scope="module")
 def heard(approach):
-    """Return five seconds of the demo's sound in blocks of 0.1 s with their stamps, rate and images."""
+    """Return 5 s of the demo's sound in blocks of 0.1 s with stamps, rate and images."""
     with open_sound(approach.audio_path, strict=False) as audio:
         rate_hz, blocks = audio.sample_rate_hz, list(audio.blocks(audio.sample_rate_hz // 10))[:50]
     found, at = read_detections(approach.detections_path), np.cumsum([0, *map(len, blocks)])
@@ -157,7 +157,7 @@ def parameters(approach, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("layout", ["interleaved", "planar"])
-def test_the_states_are_those_of_the_library_though_boxes_come_late(node_of, parameters, heard, layout):
+def test_states_of_the_node_equal_those_of_the_library(node_of, parameters, heard, layout):
     blocks, stamps_ns, rate_hz, images = heard
     node, late_ns = node_of(**parameters), 150_000_000
     coming = [(ns + len(block) * 10**9 // rate_hz, "audio", sound_message(block, ns, rate_hz, layout))
@@ -176,13 +176,13 @@ def test_the_states_are_those_of_the_library_though_boxes_come_late(node_of, par
                 listener.look(START_NS + ns, frame)
         states += listener.push(block)
     sent = [worldstate.WorldState.from_json(one["data"]) for one in node.sent["~/snapshot"]]
-    assert len(states) - len(sent) in (2, 3)  # of the last blocks the node still waits for boxes
+    assert len(states) - len(sent) in (2, 3)  # for the last blocks the node still waits for boxes
     for got, state in zip(sent, states, strict=False):
         assert got.stamp_ns == state.stamp_ns
         assert [cue.risk for cue in got.cues] == pytest.approx([cue.risk for cue in state.cues], abs=1e-6)
         assert [cue.advisory is None for cue in got.cues] == [cue.advisory is None for cue in state.cues]
         assert (got.delivery, got.budget) == (state.delivery, state.budget)
-        # Rounding of the lengths of messages moves the time of a look by nanoseconds.
+        # Rounding of message lengths changes the time of a look by nanoseconds.
         assert [one.stamp_ns for one in got.searched] == pytest.approx(
             [one.stamp_ns for one in state.searched], abs=1000, rel=0
         )
@@ -197,7 +197,7 @@ def states_of(node):
 
 
 @pytest.mark.long
-def test_lost_messages_are_heard_as_silence_and_time_goes_on(node_of, parameters, heard):
+def test_lost_messages_become_silence(node_of, parameters, heard):
     blocks, stamps_ns, rate_hz, _ = heard
     node = node_of(**parameters | {"wait_s": 0.0})
     for k, (block, ns) in enumerate(zip(blocks, stamps_ns, strict=True)):
@@ -211,7 +211,7 @@ def test_lost_messages_are_heard_as_silence_and_time_goes_on(node_of, parameters
 
 
 @pytest.mark.long
-def test_a_bag_that_is_played_again_begins_again(node_of, parameters, heard):
+def test_a_repeated_bag_restarts_the_run(node_of, parameters, heard):
     blocks, stamps_ns, rate_hz, _ = heard
     node = node_of(**parameters | {"wait_s": 0.0})
     for _ in range(2):
@@ -224,7 +224,7 @@ def test_a_bag_that_is_played_again_begins_again(node_of, parameters, heard):
 
 
 @pytest.mark.long
-def test_objects_are_published_once_odometry_tells_a_pose_in_the_map(node_of, parameters, heard):
+def test_objects_need_a_pose_in_the_map(node_of, parameters, heard):
     blocks, stamps_ns, rate_hz, _ = heard
     node = node_of(**parameters | {"wait_s": 0.0, "moving": True})
     for k, (block, ns) in enumerate(zip(blocks[:20], stamps_ns, strict=False)):
@@ -239,7 +239,7 @@ def test_objects_are_published_once_odometry_tells_a_pose_in_the_map(node_of, pa
 
 
 @pytest.mark.long
-def test_a_message_that_cannot_be_read_is_counted_and_ends_nothing(node_of, parameters, heard):
+def test_unreadable_messages_are_counted(node_of, parameters, heard):
     blocks, stamps_ns, rate_hz, images = heard
     node = node_of(**parameters | {"wait_s": 0.0})
     node.topics["detections"](image_message(images[0][1], START_NS))  # before the first sound
@@ -283,8 +283,8 @@ SampleClock = clock()
 
 
 @given(st.lists(st.integers(0, 9 * 10**8), min_size=40, max_size=120), st.integers(0, 40))
-def test_jitter_is_no_loss_and_what_is_lost_is_found(delays_ns, lost):
-    # One message in five is punctual, as a transport that keeps up delivers.
+def test_losses_are_found_and_jitter_is_none(delays_ns, lost):
+    # One message in five is punctual, as with a fast transport.
     delays_ns = [0 if k % 5 == 0 else delay for k, delay in enumerate(delays_ns)]
     made, counted = SampleClock(0), 0
     for k, delay_ns in enumerate(delays_ns):
@@ -297,7 +297,7 @@ def test_jitter_is_no_loss_and_what_is_lost_is_found(delays_ns, lost):
 
 
 @given(st.floats(-4e-4, 4e-4), st.integers(0, 10**8))
-def test_a_converter_that_drifts_stays_within_a_message_and_a_half_of_the_stamps(drift, first_ns):
+def test_clock_drift_stays_within_1_5_messages(drift, first_ns):
     made = SampleClock(first_ns)
     for k in range(8000):  # a quarter of an hour
         stamp_ns = first_ns + round(k * LENGTH_NS * (1.0 + drift))
@@ -306,7 +306,7 @@ def test_a_converter_that_drifts_stays_within_a_message_and_a_half_of_the_stamps
         assert abs(made.time_ns(stamp_ns) - (made.next_ns - LENGTH_NS)) <= 0.01 * LENGTH_NS
 
 
-def test_the_package_names_all_that_it_imports_and_installs_all_that_it_has():
+def test_the_package_declares_its_imports_and_files():
     imported = {
         name.split(".")[0]
         for file in PACKAGE.rglob("*.py")
@@ -327,7 +327,7 @@ def test_the_package_names_all_that_it_imports_and_installs_all_that_it_has():
     assert "def main()" in NODE.read_text()
 
 
-def test_every_parameter_is_explained_and_its_default_is_that_of_the_node(node_of):
+def test_documented_parameters_and_defaults_are_those_of_the_node(node_of):
     text = (PACKAGE / "config" / "worldstate.yaml").read_text()
     stated = YAML(typ="safe").load(text)["/**/worldstate"]["ros__parameters"]
     assert node_of(array="x.csv").declared == stated
@@ -363,7 +363,7 @@ def test_the_launch_file_starts_the_node_with_its_topics(monkeypatch):
     assert node["name"] == "worldstate"
 
 
-def test_the_messages_are_those_that_the_library_ships():
+def test_message_definitions_equal_those_of_the_library():
     links = sorted((MESSAGES / "msg").iterdir())
     assert [one.resolve() for one in links] == [ROOT / "worldstate" / "data" / one.name for one in links]
     built = re.findall(r"msg/\w+\.msg", (MESSAGES / "CMakeLists.txt").read_text())

@@ -1,4 +1,4 @@
-"""Samples count: no delay, disorder or repetition of stamps costs what was sent; losses are shown."""
+"""Sample counts: bad stamps lose no samples, and losses are found."""
 
 import io
 import re
@@ -27,7 +27,7 @@ def even(count: int, length_ns: int = 10 * MS) -> tuple[IntArray, FloatArray]:
 
 
 def late(kind: str, count: int, length_ns: int, rng: np.random.Generator) -> IntArray:
-    """Return stamps of messages of which nothing was lost, as recorders and drivers write them."""
+    """Return stamps of messages without losses as recorders and drivers write them."""
     stamps, k = even(count, length_ns)[0], np.arange(count)
     if kind == "jitter":
         return stamps + rng.integers(0, 5 * length_ns, count)
@@ -61,7 +61,7 @@ lengths = st.sampled_from([2 * MS, 10 * MS, 21_333_333, 100 * MS])
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=st.integers(0, 10_000), length_ns=lengths, drift=st.floats(-2e-4, 2e-4))
 @settings(max_examples=30, deadline=None)
-def test_nothing_is_missing_of_what_was_sent(kind: str, seed: int, length_ns: int, drift: float) -> None:
+def test_late_stamps_are_no_losses(kind: str, seed: int, length_ns: int, drift: float) -> None:
     stamps = late(kind, 400, length_ns, np.random.default_rng(seed))
     stamps += np.round(np.arange(400) * length_ns * drift).astype(np.int64)
     spans = np.full(400, float(length_ns))
@@ -77,10 +77,8 @@ def test_nothing_is_missing_of_what_was_sent(kind: str, seed: int, length_ns: in
     jitter=st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
-def test_what_later_messages_never_catch_up_is_missing(
-    places: list[int], length_ns: int, jitter: bool
-) -> None:
-    """The oracle is what was taken out; without jitter each loss stands before the message after it."""
+def test_permanent_delays_are_losses(places: list[int], length_ns: int, jitter: bool) -> None:
+    """The oracle is the removed messages; without jitter each loss precedes the next message."""
     after = 400 + 500 * MS // length_ns
     kept = np.setdiff1d(np.arange(after), places)
     stamps = T0 + kept * length_ns
@@ -105,7 +103,7 @@ def test_the_first_sample_is_not_later_than_later_messages_allow(first_late_s: f
 
 @given(passes=st.integers(2, 4), count=st.integers(260, 500))
 @settings(max_examples=20, deadline=None)
-def test_a_loop_is_counted_on(passes: int, count: int) -> None:
+def test_a_repeated_bag_continues_the_count(passes: int, count: int) -> None:
     stamps, spans = np.tile(even(count)[0], passes), even(count * passes)[1]
     found = begins_again(stamps, spans)
     assert found == [(k * count, k * count * 10 * MS) for k in range(1, passes)]
@@ -125,7 +123,7 @@ def write_bag(
     info: object = True,
     **storage: str,
 ) -> Path:
-    """Write six seconds in pieces of so many bytes, stamped when they begin; -1 stands for no stamp."""
+    """Write 6 s in messages of so many bytes, stamped at their beginning; -1 is no stamp."""
     data, kind = SOUND.tobytes(), "AudioDataStamped"
     recorded = stamps if recorded is None else recorded
     with bag_writer(path, **storage) as write:
@@ -147,9 +145,7 @@ def heard(path: Path, stated: RawPcm | None = None) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "zero", "a loop"])
-def test_a_bag_gives_every_sample_that_it_holds(
-    kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_sample_of_a_bag_is_read(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     stamps = late(kind, 600, 10 * MS, np.random.default_rng(3))
     recorded = even(600)[0] + 3 * MS
     if kind == "zero":
@@ -163,15 +159,17 @@ def test_a_bag_gives_every_sample_that_it_holds(
 
 
 @pytest.mark.parametrize("step", [101, 1001, 1277, 4099])
-def test_bytes_go_on_in_the_next_message(step: int, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_samples_may_be_split_between_messages(
+    step: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     stamps = T0 + np.arange(-(-SOUND.nbytes // step)) * step * SECOND // (8 * 8000)
     np.testing.assert_array_equal(heard(write_bag(tmp_path / "whole", stamps, step=step)), SOUND)
     assert not caplog.text
 
 
 @pytest.mark.parametrize("step", [1001, 1277])
-def test_a_lost_message_leaves_the_channels_where_they_were(step: int, tmp_path: Path) -> None:
-    """Of messages that split samples whole ones are lost: what follows is on the channels that it was on."""
+def test_a_lost_message_does_not_shift_channels(step: int, tmp_path: Path) -> None:
+    """Messages may split samples; later samples keep their channels."""
     count = -(-SOUND.nbytes // step)
     stamps, lost = T0 + np.arange(count) * step * SECOND // (8 * 8000), range(40, 43)
     data, path = SOUND.tobytes(), tmp_path / "bag"
@@ -187,7 +185,7 @@ def test_a_lost_message_leaves_the_channels_where_they_were(step: int, tmp_path:
     assert same[: 40 * step // 8 - 1].all() and same[43 * step // 8 + 1 :].all()
 
 
-def test_a_loop_carries_boxes_and_odometry_with_it(tmp_path: Path) -> None:
+def test_a_repeated_bag_shifts_boxes_and_odometry(tmp_path: Path) -> None:
     stamps = np.tile(even(300)[0], 2)
     recorded = even(600)[0] + 3 * MS
     data, step, path = SOUND.tobytes(), 640, tmp_path / "bag"
@@ -210,7 +208,7 @@ def test_a_loop_carries_boxes_and_odometry_with_it(tmp_path: Path) -> None:
     np.testing.assert_allclose([one.speed_mps for one in held.ego.told], 0.1 * np.arange(5, 600, 10))
 
 
-def test_boxes_and_odometry_out_of_order_or_twice_cost_themselves(tmp_path: Path) -> None:
+def test_disordered_boxes_and_odometry_cost_only_themselves(tmp_path: Path) -> None:
     stamps, _ = even(600)
     order = [0, 2, 1, 3, 3, 4]
     data, path = SOUND.tobytes(), tmp_path / "bag"
@@ -244,7 +242,7 @@ def test_boxes_and_odometry_out_of_order_or_twice_cost_themselves(tmp_path: Path
         ("passes that were mixed", {}, 2, "stamps advance by 3.0 s while 6.0 s of samples were sent"),
     ],
 )
-def test_stamps_and_rate_that_contradict_each_other_are_refused(
+def test_stamps_that_contradict_the_rate_raise_an_error(
     case: str, info: dict[str, int], stretch: int, said: str, tmp_path: Path
 ) -> None:
     path = write_bag(tmp_path / "bag", T0 + np.arange(600) // stretch * 10 * MS, info=info)
@@ -252,7 +250,7 @@ def test_stamps_and_rate_that_contradict_each_other_are_refused(
         read_sound(path)
 
 
-def test_the_format_of_bytes_may_be_stated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_audio_format_can_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bare = write_bag(tmp_path / "bare", even(600)[0], info=False)
     wrong = write_bag(tmp_path / "wrong", even(600)[0], info={"sample_rate": 24_000})
     array = tmp_path / "ring.csv"
@@ -286,7 +284,9 @@ def test_a_folder_without_metadata_is_read_from_its_files(
 
 
 @pytest.mark.parametrize(("storage", "way"), [("mcap", "`mcap recover"), ("sqlite3", "`sqlite3 IN .recover")])
-def test_a_bag_that_was_cut_names_what_may_save_it(storage: str, way: str, tmp_path: Path) -> None:
+def test_a_truncated_bag_raises_an_error_with_the_recovery_command(
+    storage: str, way: str, tmp_path: Path
+) -> None:
     path = write_bag(tmp_path / "bag", even(600)[0], storage=storage)
     (file,) = (one for one in path.iterdir() if one.suffix != ".yaml")
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
@@ -295,7 +295,7 @@ def test_a_bag_that_was_cut_names_what_may_save_it(storage: str, way: str, tmp_p
             heard(name)
 
 
-def test_samples_of_24_bits_in_four_bytes_are_named(tmp_path: Path) -> None:
+def test_24_bit_samples_in_four_bytes_are_detected(tmp_path: Path) -> None:
     wide = np.random.default_rng(2).normal(0.0, 1e5, (16_000, 4)).astype("<i4")
     for said, right in (("S24LE", False), ("S24_32LE", True)):
         path = tmp_path / said

@@ -23,12 +23,7 @@ from worldstate.ground.errors import OutOfDomainError
 from worldstate.simulation.scene.driving import trajectories
 from worldstate.simulation.scene.junction import SITES
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
-from worldstate.simulation.scene.settings import (
-    SAMPLE_RATE_HZ,
-    SimulationSettings,
-    draw_settings,
-    rate_for,
-)
+from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SimulationSettings, draw_settings, rate_for
 from worldstate.simulation.scene.vehicle import LIGHT, SOURCE_HEIGHT_M, SourceSignal, drive, emit
 from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
 from worldstate.simulation.sound.propagation import add_sources
@@ -40,7 +35,7 @@ from worldstate.simulation.sound.static_field import StaticSources
 FACTOR, ARRAY = 8, ovad_array()
 FEWER = MicrophoneArray(ARRAY.positions_m[::4])
 LOW_HZ = SAMPLE_RATE_HZ / FACTOR
-# Emission begins so many knots of the low rate before the recording, and ends with it.
+# Emission begins this number of knots before the recording and ends with it.
 BEFORE = 94
 
 
@@ -84,7 +79,7 @@ def feature_errors(number: int, duration_s: float, array: MicrophoneArray = ARRA
     samples = FACTOR * blocks * KNOT_SAMPLES
     whole = emit(path, samples, SAMPLE_RATE_HZ, settings.preset.vehicle_level_db, rng)
     less = [SourceSignal(decimated(one.signal), one.behind_m, one.height_m) for one in whole]
-    # The ambience is drawn once, at the full rate: noise drawn at each rate would be other noise.
+    # The ambience is drawn once at the full rate, because a lower rate would draw other noise.
     ambience = np.zeros((array.n_microphones, round(duration_s * SAMPLE_RATE_HZ)), np.float32)
     knots_s = np.arange(2) * KNOT_SAMPLES / SAMPLE_RATE_HZ
     receiver = Receiver(standing_m(array), np.zeros(array.n_microphones), knots_s)
@@ -112,12 +107,12 @@ def test_the_feature_does_not_change_at_an_eighth_of_the_rate() -> None:
 def test_the_feature_of_ten_recordings_does_not_depend_on_the_rate() -> None:
     errors = np.concatenate([feature_errors(number, 4.0) for number in range(10)])
     assert len(errors) == 40
-    # Asked is .01; measured .0013 in the mean and .0029 at most.
+    # The limit is 0.01; measured are 0.0013 on average and 0.0029 at most.
     assert errors.max() < 0.005
 
 
 def test_engine_lines_above_half_the_rate_do_not_alias() -> None:
-    # Lines from 1.4 to 2.8 kHz alone: at 3 kHz those above 1.5 kHz would come back below 1.2 kHz.
+    # Lines from 1.4 to 2.8 kHz only: at 3 kHz those above 1.5 kHz would alias below 1.2 kHz.
     two_kilohertz = tuple(90.0 if octave == 5 else 0.0 for octave in range(8))
     kind = replace(LIGHT, harmonic_share=1.0, propulsion_a_db=two_kilohertz, propulsion_b_db=(0.0,) * 8)
     time = np.arange(0.0, 2.0, 0.05)
@@ -137,7 +132,7 @@ def test_the_shipped_model_reads_recordings_up_to_2_khz(tmp_path: Path) -> None:
     steps = list(measure_steps(source))
     assert (soundfile.info(source.audio_path).samplerate, len(steps)) == (6000, 7)
     assert main(["model", "features", str(tmp_path), "--out", str(tmp_path / "table.csv")]) == 0
-    # A model of such windows hears full-rate sound as well: what counts is how long a frame lasts.
+    # A model of such windows also reads full-rate sound, because only the duration of frames matters.
     domain = read_features(tmp_path / "table.csv").domain
     shipped = read_model().signature.domain
     assert domain is not None and shipped is not None

@@ -10,12 +10,7 @@ from hypothesis import strategies as st
 from worldstate.commissioning.heard_stream import junction_named
 from worldstate.simulation.scene.kinds import KINDS
 from worldstate.simulation.scene.vehicle import Trajectory, crank_turns_hz, exhaust_pulses
-from worldstate.simulation.stream.close_sounds import (
-    close_sound,
-    close_vehicle,
-    idling_vehicle,
-    recorded,
-)
+from worldstate.simulation.stream.close_sounds import close_sound, close_vehicle, idling_vehicle, recorded
 from worldstate.simulation.stream.settings import StreamSettings
 
 RATE_HZ, SECONDS = 6000.0, 5.0
@@ -40,7 +35,7 @@ def test_a_passing_vehicle_swells_and_an_idling_one_does_not(kind: str) -> None:
         for one in np.random.default_rng(1).spawn(6)
     ]
     passes, idles = np.median(drawn, axis=0)
-    # A tram is 30 m long: it is beside for two seconds.
+    # A tram is 30 m long, so it is beside the recorder for two seconds.
     assert passes > idles + (1.0 if kind == "tram" else 4.0)
 
 
@@ -64,7 +59,7 @@ def test_a_motorcycle_fires_at_multiples_of_half_its_turns(seed: int, speed_mps:
         draw(path, time, np.random.default_rng(seed)) for draw in (crank_turns_hz, exhaust_pulses)
     )
     assert pulses.std() == pytest.approx(1.0, abs=0.15) and 17.0 < turns.min() <= turns.max() < 300.0
-    # Against the crank's own angle a line stands still, however the turns wander; in between there is none.
+    # As a function of the crank angle a line has constant frequency.
     angle = np.pi * np.cumsum(turns) / RATE_HZ
     at, between = (
         sum(abs((pulses * np.exp(-1j * (order + shift) * angle)).mean()) ** 2 for order in range(1, 9))

@@ -45,12 +45,12 @@ def test_every_drive_has_one_approach_in_view_before_the_stop(seed: int) -> None
     hazards = [one for one in draw_stream(drawn, PAIR).vehicles if one.hazard]
     assert len(hazards) == {"left": 1, "right": 1, "both": 2, "queue": 2}[hazards[0].event.flow]
     first_s = min(one.t0_s for one in hazards if one.t0_s is not None)
-    # The exam judges from five seconds before, and the first second has no hop; of two that come together the
-    # second may be the earlier one.
+    # The exam evaluates from five seconds before T0 on, and the first second has no hop; in a pair the second
+    # vehicle may be the earlier one.
     assert (4.0 if len(hazards) == 2 else 6.0) < first_s < drawn.ego.stop_s + 2.0
     for one in hazards:
         assert one.t0_s is not None
-        # By hand: at T0 the line from the camera passes the corner, a moment before it did not.
+        # At T0 the line from the camera passes the corner, a moment before it does not.
         for late_s, clear in ((0.011, True), (-0.011, False)):
             at = np.array([one.t0_s + late_s])
             path = one.event.manoeuvre.motion.trajectory(at - one.event.start_s)
@@ -92,7 +92,7 @@ def test_sources_removed_from_a_drive_are_inaudible() -> None:
         )
         for within in ((-np.inf, np.inf), (0.0, 8.0))
     ]
-    # Noise is drawn anew, the vehicle is the same.
+    # Noise is drawn again, the vehicle is the same.
     assert np.abs(np.subtract(*levels)).mean() < 1.5
     assert abs(levels[0].mean() - levels[1].mean()) < 0.5
 
@@ -146,7 +146,7 @@ def test_drives_of_different_renderers_have_different_names() -> None:
     assert replace(site("DMB203"), name="MB203") == site("MB203")
 
 
-# By the second renderer a place takes a second, by the third some hundredths.
+# A place takes a second with the second renderer and some hundredths with the third.
 CARRIED = st.sampled_from(["DMA101", "DMB203", "DTA101"])
 
 

@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 from scipy.signal import bilinear_zpk, find_peaks, sosfilt, stft, zpk2sos
 
 from worldstate.simulation.emitters.emitter import SYNTHESES, emitted
-from worldstate.simulation.emitters.syntheses import (
-    BREAKER_BLOWS_HZ,
-    DRILL_BLOWS_HZ,
-    hammered,
-    motor_sound,
-)
+from worldstate.simulation.emitters.syntheses import BREAKER_BLOWS_HZ, DRILL_BLOWS_HZ, hammered, motor_sound
 from worldstate.simulation.scene.octave_bands import split_octaves
 from worldstate.simulation.scene.settings import MICROPHONES, SOUNDS
 
@@ -59,7 +54,7 @@ def test_every_sound_has_the_level_of_the_table(sounds, name):
     heard = sosfilt(a_weighting_filter(FS), sounds[name].astype(float))
     power = envelope(heard, rate=8) ** 2
     level = 10 * np.log10(power[power > power.max() / 10].mean() / 20e-6**2)
-    # The filter's delay moves a blast from one eighth of a second into two.
+    # The delay of the filter moves a blast from one eighth of a second into two.
     assert level == pytest.approx(SOUNDS[name].level_db, abs=1.5 if name == "shots" else 1.0)
 
 
@@ -84,7 +79,7 @@ def test_a_siren_alternates_between_two_tones_a_fourth_apart(sounds):
     low, high = (np.abs(spectra[np.argmin(abs(frequencies - tone))]) for tone in (410.0, 547.0))
     upper = high > low
     assert 0.4 < upper.mean() < 0.6
-    # Changes every three quarters of a second.
+    # The tone changes every 0.75 s.
     assert np.abs(np.diff(upper.astype(int))).sum() == pytest.approx(SECONDS / 0.75, abs=2)
     clear = np.maximum(low, high) / np.minimum(low, high)
     assert np.median(clear) > 5.0
@@ -129,7 +124,7 @@ def test_lines_of_a_machine_follow_its_speed():
             power_spectrum(motor_sound(np.full(int(2 * FS), speed), FS, np.random.default_rng(seed)))
             for speed in (1.0, 0.5)
         )
-        # Noise has the same octaves at either speed: only lines move.
+        # Noise has the same octaves at either speed; only lines change.
         for found, spectrum in ((matched, np.interp(hz / 2.0, hz, slow)), (unmoved, slow)):
             found.append(np.corrcoef(np.log(spectrum), np.log(fast))[0, 1])
     assert np.mean(matched) > np.mean(unmoved) + 0.1
@@ -149,7 +144,7 @@ def test_a_hammer_is_modulated_at_its_blows(seed, blows_hz):
 
 def test_steps_have_the_rate_of_a_walker(sounds):
     swell = envelope(sounds["steps"])
-    # Heel and sole are 0.14 s apart: nothing nearer than a third of a second is another step.
+    # Heel and sole are 0.14 s apart, so a further step is at least a third of a second later.
     heels = find_peaks(swell, height=0.3 * swell.max(), distance=33)[0]
     assert np.diff(heels).mean() / 100 == pytest.approx(1 / 1.9, rel=0.15)
 

@@ -140,7 +140,7 @@ def test_a_house_attenuates_a_siren_in_another_street():
     behind = heard(placed("siren", 120.0, 60.0), plan=plan)
     free = heard(placed("siren", 120.0, 60.0))
     assert 10.0 < level_db(free) - level_db(behind) < QUIET.screen_cap_db + 1.0
-    assert level_db(behind) > 55.0  # and is still heard
+    assert level_db(behind) > 55.0  # and is still audible
 
 
 def test_rain_is_loud_and_incoherent_at_all_microphones():
@@ -148,7 +148,7 @@ def test_rain_is_loud_and_incoherent_at_all_microphones():
     sound = heard(SoundSettings("rain", 0.0, 3.0), positions, seconds=3.0, fs=24_000.0)
     levels = [level_db(channel) for channel in sound]
     assert np.ptp(levels) < 3.0
-    # Moderately loud: A-weighted 58 dB, and a bit less or more without the weighting.
+    # Moderately loud: 58 dB(A), and similar without the weighting.
     assert np.mean(levels) == pytest.approx(sound_kind("rain").level_db, abs=3.0)
     frequencies, between = coherence(sound[0], sound[4], 24_000.0, nperseg=512)
     assert between[(frequencies > 500) & (frequencies < 8000)].mean() < 0.1
@@ -161,7 +161,7 @@ def test_rain_at_a_low_rate_is_the_same_rain_band_limited():
         spectrum = np.abs(np.fft.rfft(drops[0])) ** 2 / len(drops[0]) ** 2
         frequencies = np.fft.rfftfreq(len(drops[0]), 1 / fs)
         in_band.append(spectrum[(frequencies > 300) & (frequencies < 2500)].sum())
-    # 240 drops of exponential strengths: their power is known to a tenth.
+    # 240 drops of exponential strength determine the power within a tenth.
     assert 10 * np.log10(in_band[0] / in_band[1]) == pytest.approx(0.0, abs=1.5)
 
 
@@ -172,7 +172,7 @@ def test_gusts_affect_only_their_microphones():
     octave = split_octaves(sound[1], FS)[:2].std(axis=1)
     assert octave.max() > 10 * split_octaves(sound[1], FS)[4].std()
     blowing = np.square(sound[[1, 2], : len(sound[0]) // 600 * 600].reshape(2, -1, 600)).mean(axis=2)
-    assert (blowing > 1e-6 * blowing.max()).mean() < 0.9  # they come and go
+    assert (blowing > 1e-6 * blowing.max()).mean() < 0.9  # they begin and end
     assert abs(np.corrcoef(sound[1], sound[2])[0, 1]) < 0.3
 
 
@@ -188,13 +188,13 @@ def test_wind_levels_are_equal_and_incoherent_at_all_microphones(over_db, lasts_
     assert fifths.argmax() == 2
     frequencies, between = coherence(sound[0, within], sound[4, within], FS, nperseg=256)
     assert between[frequencies > 60.0].mean() < 3.0 * 256 / (lasts_s * FS) + 0.02
-    # In the middle, within a fifth of its time, the octave of 100 Hz has the level that was asked for.
+    # Within a fifth of the time around the middle the octave of 100 Hz has the requested level.
     middle = sound[:, round((0.5 + 0.4 * lasts_s) * FS) : round((0.5 + 0.6 * lasts_s) * FS)]
     frequencies, density = welch(middle, FS, nperseg=min(800, middle.shape[1]))
     octave = (frequencies >= 100.0 / np.sqrt(2.0)) & (frequencies <= 100.0 * np.sqrt(2.0))
     power = density[:, octave].mean() * 100.0 / np.sqrt(2.0)
     assert 10.0 * np.log10(power / 4e-10) == pytest.approx(77.0 + over_db, abs=3.0)
-    # Three octaves higher it has fallen by 3.7 times 9 dB.
+    # Three octaves higher the level is lower by 3.7 times 9 dB.
     high = (frequencies >= 600.0) & (frequencies <= 1000.0)
     fallen_db = 10.0 * np.log10(density[:, octave].mean() / density[:, high].mean())
     assert fallen_db == pytest.approx(37.0 * np.log10(780.0 / 98.0), abs=4.0)
@@ -240,7 +240,7 @@ def test_an_added_sound_leaves_the_rest_unchanged():
     with_voice = replace(scene, sounds=(SoundSettings("voice", 0.5, 0.4, (4.0, 0.0)),))
     plain, voiced = (simulate_recording(one, np.random.default_rng(4), PAIR) for one in (scene, with_voice))
     assert plain.detections == voiced.detections and plain.truth["frames"] == voiced.truth["frames"]
-    # Octave bands begin a little earlier; sources that are rendered together round together.
+    # Octave bands begin a little earlier, and sources of one rendering share rounding errors.
     begin = int(0.45 * FS)
     np.testing.assert_allclose(plain.audio[:begin], voiced.audio[:begin], atol=2e-6)
     added = voiced.audio - plain.audio

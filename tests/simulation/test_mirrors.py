@@ -20,7 +20,7 @@ from worldstate.simulation.sound.static_field import PlacedSource, StaticSources
 
 FS = 6000.0
 EAR = np.zeros(2)
-# A junction whose streets are closed at their ends: own street along x, crossing street along y.
+# A junction of streets with closed ends: own street along x, crossing street along y.
 JUNCTION = np.array([(-9, -3), (5, -3), (5, -24), (12, -24), (12, 26), (5, 26), (5, 3), (-9, 3)], float)
 YARD = np.array([(-6, -4), (14, -4), (14, 7), (-6, 7)], float)
 
@@ -175,7 +175,7 @@ def test_the_level_is_continuous_at_the_edge_of_the_shadow(plan, side) -> None:
         if np.allclose(length, straight) or np.allclose(length, bent):
             total += way.gain[:, 5] / length
     level_db = 20.0 * np.log10(total * straight)
-    assert np.abs(np.diff(level_db)).max() < 3.0  # in 0.1 m; an edge that cuts would lose all of it
+    assert np.abs(np.diff(level_db)).max() < 3.0  # in 0.1 m; a hard edge would lose all of it
     assert level_db[40] == pytest.approx(-6.0, abs=1.0)
     assert level_db[0] < -9.0 and abs(level_db[-1]) < 1.0
 

@@ -19,7 +19,7 @@ FS, NFFT = 12_000.0, 128
 GRID = np.stack(np.meshgrid(*[np.arange(4.0)] * 2), axis=-1).reshape(-1, 2)
 ZERO = np.zeros((16, 1))
 CUBE = np.stack(np.meshgrid(*[np.arange(2.0)] * 3), axis=-1).reshape(-1, 3)
-# In metres; the cube stands on a mast.
+# In metres; the cube is on a mast.
 ARRAYS = {
     "pair": [[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]],
     "line across": np.outer(np.arange(5.0), [0.0, 0.09, 0.0]),
@@ -40,7 +40,7 @@ QUIET = replace(preset(), far_rate=0.0, ambient_waves=8, **STILL, **EXACT)
 def passing(azimuth_deg: float, name: str) -> np.ndarray:
     """Return the sound of a slow car 15 m away at an azimuth, in the open."""
     x, y = 15.0 * np.cos(np.radians(azimuth_deg)), 15.0 * np.sin(np.radians(azimuth_deg))
-    # Its axles are behind the front: towards us, so that both are at the same azimuth.
+    # The axles are behind the front towards the array, so both have the same azimuth.
     way = ((2.0 * x, 2.0 * y), (x, y))
     scene = SimulationSettings(
         place("open-road").site, "left", 0.5, entry_s=0.3, speed_mps=1.0, sample_rate_hz=FS, route_m=way,

@@ -205,8 +205,8 @@ DRAWN_ONLY = (Phase.explicit, Phase.reuse, Phase.generate)  # each takes half a 
 @given(st.floats(1.2, 1.8), st.floats(3.0, 4.5), st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
 def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, arm):
     """At 1.5 m/s steps are small until the steep edge of the corner's shadow."""
-    # Draws have .8 to 1.1 dB at most, one in many had 1.54: with steps half as long it was gone, where a
-    # click would have stayed.
+    # Draws have 0.8 to 1.1 dB at most and rarely 1.54, which half as long steps remove, in contrast to a
+    # click.
     across, lane = side * beside, STREET.corner_ahead_m + beyond
     turn = (lane - 0.4, across + arm * 0.2), (lane, arm * 3.2)
     points = ((-4.0, across), (3.0, across), *turn, (lane, arm * 9.0))

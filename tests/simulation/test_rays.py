@@ -45,7 +45,7 @@ def test_specular_rays_equal_image_sources() -> None:
         room.add_microphone([0.5 * ROOM_M[0], 0.5 * ROOM_M[1], EAR_M])
         room.image_source_model()
         images = room.sources[0].images.T - room.mic_array.R[:, 0]
-        # Amplitudes of the walls; half of the energy, for the road is in the levels of sources already.
+        # Amplitudes of the walls; half of the energy, because the road is part of the source levels.
         gain = 0.5 * room.sources[0].damping[0] ** 2 / (images**2).sum(axis=1)
         late = np.hypot(*(images[:, :2] - place).T) > 1e-6
         expected = gain[late].sum()

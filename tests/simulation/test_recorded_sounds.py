@@ -50,7 +50,7 @@ def test_short_recordings_are_repeated_and_pauses_kept(tmp_path):
     folder = folder_of(tmp_path, "dog", band_noise(0.3, 16_000), 16_000)
     heard = emitted(SOUNDS["dog"], 24_000, 8_000.0, np.random.default_rng(2), folder)
     assert np.square(heard).reshape(-1, 800).mean(axis=1).min() > 0.0
-    # One bark in twenty seconds: what else is in the file is not made as loud as it.
+    # One bark in twenty seconds: the rest of the file is not amplified to its level.
     barks = 1e-4 * np.random.default_rng(1).standard_normal(20 * 16_000)
     barks[:4_800] += band_noise(0.3, 16_000)
     folder = folder_of(tmp_path, "dog", barks, 16_000)

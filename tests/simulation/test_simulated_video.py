@@ -29,19 +29,13 @@ from worldstate.simulation import (
 from worldstate.simulation.camera.street_view import (
     ROAD_Z_M,
     Panel,
-    Patch,
     View,
     cast_panels,
     cast_solid,
     paint_street,
 )
 from worldstate.simulation.camera.vehicle_view import Car, add_car
-from worldstate.simulation.dataset.dataset import (
-    camera_frames,
-    parked_lane_m,
-    parked_middle_m,
-    write_video,
-)
+from worldstate.simulation.dataset.dataset import camera_frames, parked_lane_m, parked_middle_m, write_video
 from worldstate.simulation.scene.vehicle import HEIGHT_M, LENGTH_M, WIDTH_M
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.1]])
@@ -134,7 +128,6 @@ def test_a_patch_contains_the_projection():
         slice(patch.top // 2, patch.bottom // 2),
         slice(patch.left // 2, patch.right // 2),
     )
-    assert isinstance(patch, Patch)
 
 
 def test_a_car_fills_the_projection_of_its_cuboid():
@@ -144,7 +137,7 @@ def test_a_car_fills_the_projection_of_its_cuboid():
     image = still.copy()
     car = Car(8.0, 2.2, 1, RED)
     add_car(street, car, image)
-    # Paint and lamps, not the shadow: what is red or brighter than the road can be.
+    # Paint and lamps without the shadow: red, or brighter than the road can be.
     body = (np.abs(image - still).max(axis=2) > 30.0) & (image.max(axis=2) > image.min(axis=2) + 60.0)
     body |= (image.min(axis=2) > 215.0) & (still.min(axis=2) < 150.0)
     rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
@@ -219,7 +212,7 @@ def test_the_position_of_the_parked_car_follows_from_its_boxes(seed, name):
     right, left = plan.sight_m(parked_lane_m(plan), PinholeCamera.ovad().position_m[:2])
     middle = np.random.default_rng(seed).uniform(0.6 * right, 0.6 * left)
     found = parked_middle_m(park(plan, PinholeCamera.ovad(), 20, rng), plan)
-    # Where the line of sight cuts the car off, its box tells one end only; that end is in the picture.
+    # A car that the line of sight cuts off has one true end in its box, which is in the image.
     assert found == pytest.approx(middle, abs=0.25)
 
 
@@ -233,7 +226,7 @@ def test_the_parked_car_is_drawn_in_its_box():
     )
     rows, columns = (np.flatnonzero(changed(with_car, without, 8).any(axis=i)) for i in (1, 0))
     left, top, right, bottom = np.array(recording.detections[0][0].box_px) * 640 / 1936
-    # Beside and below lies its shadow, up to half a metre: 25 pixels.
+    # The shadow extends half a metre beside and below, 25 pixels.
     assert -25 < columns[0] - left < 3
     assert -3 < columns[-1] - right < 25
     assert rows[0] == pytest.approx(top, abs=4)

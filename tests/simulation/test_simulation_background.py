@@ -71,7 +71,7 @@ def test_the_level_is_constant_within_and_between_blocks():
     hop = one.grid.hop
     folded = (sound[: len(sound) // hop * hop].reshape(-1, hop) ** 2).mean(axis=0)
     assert folded.mean() == pytest.approx(0.5 * FS, rel=0.02)
-    assert folded.std() < 0.05 * folded.mean()  # a window whose squares do not add up to one: .35
+    assert folded.std() < 0.05 * folded.mean()  # 0.35 for a window whose squares do not sum to one
 
 
 def test_a_field_in_pieces_equals_one_rendered_at_once():
@@ -92,7 +92,7 @@ def test_flicker_has_its_deviation_and_keeps_the_mean_level():
     for before, after in zip(still, flickering, strict=True):
         mean_db = 10.0 * np.log10((10.0 ** (after / 10.0)).mean() / (10.0 ** (before / 10.0)).mean())
         assert abs(mean_db) < 0.3
-        # An octave's band reaches into its neighbours, and 0.04 s into what comes next.
+        # The band of an octave overlaps its neighbours, and 0.04 s overlap the next interval.
         assert 0.75 < np.sqrt(after.var() - chance) / deviation_db < 1.05
         off, lag = after - after.mean(), round(FLICKER_S / step)
         kept = (off[lag:] * off[:-lag]).mean() / (after.var() - chance)
@@ -121,7 +121,7 @@ def test_a_site_has_the_same_background_in_every_recording():
     log = np.log([[empty_window(name, seed, calm) for seed in range(4)] for name in names])
     pattern = log - log.mean(axis=2, keepdims=True)
     between, within = pattern.mean(axis=1).std(axis=0).mean(), pattern.std(axis=1).mean()
-    alone = within / np.sqrt(4.0)  # what recordings of one and the same place would differ by
+    alone = within / np.sqrt(4.0)  # the difference between recordings of one place
     assert between > 1.5 * alone
 
 
@@ -197,7 +197,7 @@ def test_a_rough_road_raises_tyre_noise_and_its_echo():
         louder_db.append([10.0 * np.log10((one**2).mean()) for one in (echo, np.diff(own, axis=0))])
     change = np.subtract(*louder_db[::-1])
     assert change[0] == pytest.approx(10.0, abs=1.0)
-    assert 3.0 < change[1] < 10.0  # wind and airflow stay as they are
+    assert 3.0 < change[1] < 10.0  # wind and airflow stay unchanged
 
 
 def passing(surface_db: float, bass_db: float) -> np.ndarray:
@@ -218,7 +218,7 @@ def passing(surface_db: float, bass_db: float) -> np.ndarray:
 
 def test_a_rough_road_raises_tyres_and_not_engines():
     change_db = passing(8.0, 0.0) - passing(0.0, 0.0)
-    assert change_db[0] < 2.5  # at 20 km/h the engine has the octave of 125 Hz to itself
+    assert change_db[0] < 2.5  # at 20 km/h the octave of 125 Hz has only the engine
     assert change_db[1] == pytest.approx(8.0, abs=1.0)
 
 

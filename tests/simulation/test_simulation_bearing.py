@@ -15,7 +15,7 @@ from worldstate.simulation import SITES, SimulationSettings, Site, preset, simul
 
 AZIMUTHS_RAD, NFFT = np.radians(np.arange(-90.0, 91.0)), feature_nfft(RATE_HZ)
 BAND_HZ = (300.0, 1500.0)
-# Nothing but the vehicle and the corners.
+# Only the vehicle and the corners.
 QUIET = replace(
     preset(),
     ambient_octaves_db=(-20.0,) * 8,

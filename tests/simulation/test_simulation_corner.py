@@ -110,7 +110,7 @@ def test_an_opening_removes_the_reflections_on_it(begin, length, y):
     holed = trace_paths(
         Site("SB1", **plan, **walls, right_openings_m=(opening,)), 7.0, np.array([y]), 1.4, 60.0
     )
-    aim = min(4.0 / 7.0 * (y + 5.6) - 5.6, 12.0)  # where the line passes the mouth
+    aim = min(4.0 / 7.0 * (y + 5.6) - 5.6, 12.0)  # at the mouth
     met = 4.0 * 2.8 / (aim + 5.6)
     share = [float((b.gain / np.maximum(a.gain, 1e-12)).max()) for a, b in zip(whole, holed, strict=True)]
     assert share[0] == share[1] == 1.0
@@ -122,10 +122,10 @@ def test_an_opening_removes_the_reflections_on_it(begin, length, y):
 
 @given(st.floats(1.5, 3.5), st.floats(4.0, 7.0), st.floats(2.0, 8.0), st.floats(0.1, 40.0))
 def test_images_of_a_hidden_vehicle_follow_one_another(aside, ahead, lane, y):
-    """Between walls w to either side the image of order n stands at atan((2 n w + y) / (D + l)).
+    """Between walls at distance w the image of order n has the azimuth atan((2 n w + y) / (D + l)).
 
-    It is lit from atan((2 n - 1) w / D) to atan((2 n + 1) w / D): with hard walls what is heard of a vehicle
-    that approaches from the left goes from the left's wide angles (n = 2) to the right's middle ones (n = 1).
+    It is visible from atan((2 n - 1) w / D) to atan((2 n + 1) w / D). With hard walls a vehicle from the left
+    changes from wide angles on the left (n = 2) to middle ones on the right (n = 1).
     """
     site = Site("SB1", aside, aside, ahead, None, aside, aside, 6.0)
     paths = trace_paths(site, ahead + lane, np.array([y]), 0.0, 60.0)

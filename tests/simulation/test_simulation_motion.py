@@ -126,7 +126,7 @@ SCENES = {
     **{name: (lambda n=name: scene_settings(n)) for name in HIDDEN_IN_THE_OPEN},
 }
 
-# "moving turn" takes the same ways as "moving", and more of them.
+# "moving turn" includes the paths of "moving".
 SHOWN = [pytest.param(name, marks=[pytest.mark.slow] * (name == "moving")) for name in SCENES]
 
 
@@ -164,7 +164,7 @@ def test_paths_of_a_moving_ego_change_without_clicks(name):
 def test_energy_is_continuous_through_the_whole_recording_and_line_of_sight_entry(name):
     """Noise in windows of 50 ms: no step beyond what 50 ms of movement and chance make, and no gap."""
     power = (heard(SCENES[name](), noise).reshape(200, -1) ** 2).mean(axis=1)
-    # Behind a rigid wedge a vehicle near the mouth grows by 20 dB within .3 s.
+    # Behind a rigid wedge the level of a vehicle near the mouth rises by 20 dB within 0.3 s.
     assert np.abs(np.diff(10 * np.log10(power))).max() < 5.0
 
 
@@ -175,7 +175,7 @@ def test_truth_has_route_sight_and_time_of_every_vehicle():
         VehicleSettings("left", 9.0, manoeuvre="turn"),
     )
     drawn = draw_settings("DA2", "left", np.random.default_rng(2))
-    # Mirror images only cost time here: the truth does not depend on them.
+    # Mirror images cost time and do not affect the truth.
     bare = replace(drawn.site, side_order=0, facade_order=0)
     scene = replace(drawn, site=bare, others=others, sample_rate_hz=8e3)
     recording = simulate_recording(scene, np.random.default_rng(2), PAIR)
@@ -201,7 +201,7 @@ def test_truth_has_route_sight_and_time_of_every_vehicle():
 def test_own_noise_follows_the_speed():
     """Tyres from 500 Hz to 2 kHz exceed an empty street while driving and end at the stop."""
     ego = EgoMotion(8.0, 3.0)
-    # A distant vehicle would be a noise that does not follow, and a loud town hides what does.
+    # A distant vehicle would be a noise that does not follow, and a loud town masks the own noise.
     calm = replace(preset(), far_rate=0.0, ambient_octaves_db=(45.0,) * 8)
     scene = SimulationSettings(site("DB1"), "none", duration_s=4.0, sample_rate_hz=8e3, preset=calm)
     driving, standing = (
@@ -234,7 +234,7 @@ def test_no_scene_gives_silence_nan_or_a_click(data):
         data.draw(st.floats(0.0, 8.0)),
         data.draw(st.sampled_from(sorted(KINDS))),
         data.draw(st.sampled_from(["pass", "turn"])),
-        # Where bodies stand these ways would lead through them, where no vehicle drives.
+        # With bodies these routes would lead through them.
         () if drawn.site.occluders else data.draw(st.sampled_from([(), THROUGH_US, BENT])),
     )
     scene = replace(

@@ -122,7 +122,7 @@ def test_a_vehicle_emits_the_power_of_its_kind(name):
         [law(np.array([10.0]), path.kind)[:, 0] for law in (rolling_level_db, propulsion_level_db)]
     )
     expected = 10.0 * np.log10((10.0 ** (laws / 10.0)).sum(axis=0)) - 8.0
-    # Lines of an engine fall where they fall: an octave's share is not exact, the sum of all nearly is.
+    # Lines of an engine are not centred in octaves, so only the sum of all is nearly exact.
     np.testing.assert_allclose(10.0 * np.log10(power)[2:], expected[2:], atol=2.5)
     assert 10.0 * np.log10(power.sum() / (10.0 ** (expected / 10.0)).sum()) == pytest.approx(0.0, abs=1.0)
     assert len(parts) == len(path.kind.axles_m) + (name not in ("bicycle",))
@@ -147,7 +147,7 @@ def test_engine_speed_follows_gears_within_five_per_cent(speed, braking, seed):
     driven = np.interp(time, TIME_S, path.speed_mps)
     assert firing.min() > 0.94 * IDLE_HZ
     assert firing.max() < 1.06 * max(IDLE_HZ, GEARS_HZ_PER_MPS[0] * driven.max())
-    # Away from changes of gear it is one of the ratios, give or take the wander, or idle.
+    # Between changes of gear the speed is one of the ratios within the wander, or idle.
     ratios = firing / driven
     nearest = np.abs(ratios[:, None] / np.array(GEARS_HZ_PER_MPS) - 1.0).min(axis=1)
     idle = np.abs(firing / IDLE_HZ - 1.0)
@@ -168,7 +168,7 @@ def test_a_turning_vehicle_stops_before_the_ego(approach, speed):
     np.testing.assert_allclose(step, path.speed_mps[1:], atol=0.12 * speed + 0.05)
     turning = (np.abs(y) < 3.0) & (x < path.lane_x_m - 0.5)
     assert path.speed_mps[turning].max() < TURN_MPS * 1.1
-    assert 2.0 < x[-1] < 3.05  # beside the bonnet where the near lane leaves no more room
+    assert 2.0 < x[-1] < 3.05  # beside the bonnet if the near lane has no more room
     assert y[-1] == pytest.approx(1.2, abs=0.01)
     assert path.speed_mps[-1] < 0.5
     straight = trajectories(replace(scene, manoeuvre="pass"), path.time_s)[0]
@@ -247,7 +247,7 @@ def test_the_detour_is_continuous_at_line_of_sight(name):
     (path,) = trajectories(told, time)
     for occluder in there.site.occluders:
         detour = detours(occluder, *path.behind(0.0), (0.0, 0.0))[0]
-        near = np.abs(detour) < 0.2  # beyond, nothing is screened any more
+        near = np.abs(detour) < 0.2  # beyond, nothing is screened
         if near.any():
             assert np.abs(np.diff(detour))[near[1:] & near[:-1]].max() < 0.012  # 9 m/s, 1 ms
 

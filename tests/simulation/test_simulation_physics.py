@@ -24,7 +24,7 @@ from worldstate.simulation.sound.static_field import StaticSources
 
 FS = 48_000.0
 C = SPEED_OF_SOUND_MPS
-# Corners far to the sides: everything is in the light and nothing reflects.
+# Corners far to the sides: everything is in view and nothing reflects.
 FREE_FIELD = Site("Free1", 30.0, 30.0, 1.0, None, 30.0, 30.0, 12.0, side_order=0, facade_order=0)
 
 
@@ -116,7 +116,7 @@ def test_the_doppler_shift_is_that_of_the_retarded_position():
     expected = f0 / (1.0 + radial / C)
     inner = slice(4800, -4800)
     assert np.abs(received[inner] / expected[inner] - 1.0).max() < 1e-4
-    assert np.ptp(expected[inner]) > 40.0  # the test has something to see
+    assert np.ptp(expected[inner]) > 40.0  # the shift is large enough for the test
 
 
 def acoular_signal(acoular, samples):

@@ -48,7 +48,7 @@ from worldstate.simulation.stream.truth import visible_s
 from worldstate.simulation.stream.writing import draw_stream, write_stream
 
 PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
-# Nothing that swells or fades by itself: what is left is stationary.
+# No source changes its level, so the rest is stationary.
 STILL = replace(preset(), name="still", far_rate=0.0, wave_fluctuation_db=0.0, ambient_waves=8)
 
 
@@ -69,8 +69,8 @@ def sound_of(scene: StreamScene, events: Sequence[Event]) -> Float32Array:
 
 def test_a_stream_is_the_sum_of_background_and_events() -> None:
     scene = scene_of(36.0 / 60.0, rate_hz=3000.0)
-    # The first began before the stream, the second and third overlap over the edge of a piece (30 s), the
-    # last goes on after the end.
+    # The first begins before the stream, the second and third overlap the edge of a piece (30 s), the
+    # last ends after the stream.
     early, late = event_at(-1.0, reach_m=8.0), event_at(34.5, reach_m=8.0)
     steps = SoundEvent(SoundSettings("steps", 2.0, 3.0, (3.0, 2.0)), 27.0)
     events = [early, event_at(28.5, reach_m=8.0), event_at(29.5, "turns_away", 10.0), late, steps]
@@ -109,7 +109,7 @@ def test_rain_of_a_stream_is_continuous_and_incoherent() -> None:
     )
     dry = replace(dry, seed=raining.seed)
     rain = np.subtract(*(sound_of(draw_stream(one, PAIR).scene, ()) for one in (raining, dry)))
-    # Pieces of 30 s meet at 30 and 60 s. Two seconds of two channels hold 160 drops of exponential strengths.
+    # Pieces of 30 s join at 30 and 60 s. Two seconds of two channels have 160 drops of exponential strength.
     seconds_db = 10.0 * np.log10(np.square(rain).reshape(2, -1, 6000).mean(axis=(0, 2)))
     assert np.abs(seconds_db - np.median(seconds_db)).max() < 4.0
     frequencies, between = coherence(*rain, 3000.0, nperseg=256)
@@ -139,7 +139,7 @@ def test_events_rise_to_line_of_sight_from_silence_to_silence() -> None:
     assert levels.argmax() == pytest.approx(np.searchsorted(rows, t0_s) + 4, abs=8)
     edge = np.abs(alone.pressure_pa[:, [0, -1]]).max()
     assert edge < 1e-4 * np.abs(alone.pressure_pa).max()
-    # An oracle of its own: the level of one microphone's samples about one row.
+    # Independent oracle: the level of the samples of one microphone about one row.
     at = round((rows[50] - 2.0) * 3000)
     around = alone.pressure_pa[:, at - 150 : at + 150].astype(float)
     assert levels[50] == pytest.approx(10 * np.log10((around**2).mean() / 4e-10), abs=0.02)
@@ -181,7 +181,7 @@ def test_a_signal_is_added_to_the_unchanged_vehicle() -> None:
         for one in (event, replace(event, signal="siren"))
     )
     frequency, power = welch((warning - plain)[0], 3000.0, nperseg=1024)
-    # In the hidden arm it comes towards us: both tones are up to 3 % higher.
+    # The vehicle approaches in the hidden arm, so both tones are up to 3 % higher.
     tones = [(frequency > tone) & (frequency < 1.04 * tone) for tone in (400.0, 535.0)]
     assert sum(power[tone].sum() for tone in tones) > 0.5 * power[frequency < 700.0].sum()
     assert (warning - plain).std() > 3 * plain.std()
@@ -202,7 +202,7 @@ def test_pieces_of_background_join_without_a_seam() -> None:
     ratio_db = 10.0 * np.log10(spectra[0] / spectra[1])[8:]  # from 60 Hz
     assert abs(ratio_db.mean()) < 0.3
     assert np.abs(ratio_db).max() < 2.0
-    # A click is a sample that its neighbours do not foretell.
+    # A click is a sample that its neighbours do not predict.
     jump = np.abs(np.diff(sound, n=3)).max(axis=0)
     near = max(jump[edge - 20 : edge + overlap + 20].max() for edge in edges)
     assert near < 1.2 * jump.max() and near < 8.0 * jump.std() + jump.mean()
@@ -278,7 +278,7 @@ def test_a_stream_on_disk_reads_as_a_recording(tmp_path: Path, capsys: pytest.Ca
         np.testing.assert_allclose([float(row["time_s"]) for row in own], track.time_s)
         np.testing.assert_array_equal([row["in_view"] == "1" for row in own], track.in_view)
         assert all((row["time_to_visible_s"] == "") == (event["t0_s"] is None) for row in own)
-    # As hazard-free time of an evaluation it is refused while anything comes out of a hidden arm.
+    # It is no hazard-free time for an evaluation if any vehicle comes out of a hidden arm.
     listed = tmp_path / "SB1" / "none" / "2_02_0000"
     shutil.copytree(folder, listed)
     (tmp_path / "DataLog.csv").write_text("ID,Environment,Class,T0\n2_02_0000,SB1,none,70\n")

@@ -16,12 +16,7 @@ from worldstate.simulation import preset, site
 from worldstate.simulation.scene.kinds import LIGHT, vehicle_kind
 from worldstate.simulation.scene.settings import SoundSettings
 from worldstate.simulation.scene.vehicle import along
-from worldstate.simulation.stream.arrivals import (
-    SoundEvent,
-    VehicleEvent,
-    draw_events,
-    draw_sounds,
-)
+from worldstate.simulation.stream.arrivals import SoundEvent, VehicleEvent, draw_events, draw_sounds
 from worldstate.simulation.stream.manoeuvres import (
     MANOEUVRES,
     Driver,
@@ -59,7 +54,7 @@ def test_counts_of_every_flow_are_poisson_over_seeds() -> None:
     for flow, rate in rates.items():
         number = np.array([count[flow] for count in counts])
         expected = rate * hours
-        # Index of dispersion about the mean that was asked for: chi-square with one degree a seed.
+        # Index of dispersion about the requested mean: chi-square with one degree of freedom per seed.
         dispersion = ((number - expected) ** 2 / expected).sum()
         assert chi2.ppf(1e-4, seeds) < dispersion < chi2.ppf(1.0 - 1e-4, seeds), flow
 
@@ -77,7 +72,7 @@ def test_a_busy_hour_has_every_event_and_only_hazards_leave_an_arm(name: str) ->
         assert (one["t0_s"] is None) == (one["flow"] in NEVER_SEEN)
         inside = vehicle.in_view & (vehicle.time_s < (one["t0_s"] or np.inf) - 0.01)
         assert not inside.any()
-        if one["flow"] in {"from_behind", "from_ahead"}:  # in view, and then gone into its arm
+        if one["flow"] in {"from_behind", "from_ahead"}:  # in view, and later in its arm
             seen = np.flatnonzero(vehicle.in_view)
             assert not seen.size or seen[-1] < len(vehicle.time_s) - 5
             assert abs(vehicle.y_m[-1]) > 5.0 or one["last_s"] > 3600.0
@@ -90,7 +85,7 @@ def test_approaches_have_the_requested_numbers_in_turn(seed: int) -> None:
     assert counts == {"left": 10, "right": 10, "both": 20, "queue": 6, "follows": 6}
     entries = [visible_s(event, site("SB1")) for event in events if event.flow in HAZARDS]
     first = np.sort([entry for entry in entries if entry is not None])
-    # Two that come together lie within some standard deviations of .7 s, strangers half a turn of 24 s apart.
+    # Pairs are within some standard deviations of 0.7 s, others half a turn of 24 s apart.
     assert not ((np.diff(first) > 3.0) & (np.diff(first) < 8.0)).any()
 
 
@@ -146,11 +141,7 @@ def test_time_to_visible_at_constant_speed_is_distance_over_speed(
     assert truth.in_view[(left < 0.0) & (left > -0.2)].all()
 
 
-@given(
-    cruise=st.floats(2.0, 15.0),
-    stop=st.floats(20.0, 60.0),
-    stands_s=st.floats(0.5, 20.0),
-)
+@given(cruise=st.floats(2.0, 15.0), stop=st.floats(20.0, 60.0), stands_s=st.floats(0.5, 20.0))
 def test_a_stop_follows_uniform_deceleration_and_acceleration(
     cruise: float, stop: float, stands_s: float
 ) -> None:
@@ -196,10 +187,10 @@ def test_boxes_have_the_rates_of_misses_and_clutter() -> None:
     seen = np.zeros(len(frames), dtype=int)
     for one in vehicles:
         seen[np.rint(10 * one.time_s[one.in_view]).astype(int)] += 1
-    clear = np.convolve(seen, np.ones(21), "same") == 0  # a second and more from any line of sight
+    clear = np.convolve(seen, np.ones(21), "same") == 0  # at least a second from any line of sight
     assert not added[clear].any()
     missed = 1.0 - np.minimum(added, seen)[seen > 0].sum() / seen[seen > 0].sum()
-    assert 0.02 < missed < 0.25  # 4 to 14 % by azimuth, and what is seen in part at the image's edge
+    assert 0.02 < missed < 0.25  # 4 to 14 % by azimuth, and partly visible boxes at the edge of the image
     boxes = sum(len(frame) for frame in alone) - (6000 if len(alone[0]) else 0)
     expected = CLUTTER_PER_HOUR / 6 * np.mean(CLUTTER_IMAGES)
     assert abs(boxes - expected) < 5 * np.sqrt(expected * 2.5)
@@ -223,9 +214,7 @@ def test_other_sounds_have_their_rate_and_rain_removes_boxes() -> None:
 
 
 @pytest.mark.parametrize("where", ["SA1", "SB3"])
-def test_a_stop_lasts_2_to_10_s_before_line_of_sight(
-    where: str,
-) -> None:
+def test_a_stop_lasts_2_to_10_s_before_line_of_sight(where: str) -> None:
     settings = StreamSettings(site(where), 60.0, traffic=traffic_named("stops"))
     stopped_s = []
     for number, event in enumerate(draw_events(settings, np.random.default_rng(1))):
@@ -235,7 +224,7 @@ def test_a_stop_lasts_2_to_10_s_before_line_of_sight(
         stopped_s.append(np.ptp(still))
         assert truth.hazard
         assert truth.t0_s is not None
-        # From rest a vehicle needs more than a second for the metre at least that is left.
+        # From rest a vehicle needs over a second for the remaining metre or more.
         assert 1.0 < truth.t0_s - (event.start_s + still[-1]) < 5.0
     assert len(stopped_s) == 150
     assert 2.0 - 0.02 < min(stopped_s) < 2.5
@@ -289,7 +278,7 @@ def test_background_levels_are_uniform_and_rain_has_its_share() -> None:
     share = traffic_named("town-varied").rain_share
     assert abs(len(rain_db) - 400 * share) < 4.0 * np.sqrt(400 * share * (1.0 - share))
     assert RAIN_DB[0] <= min(rain_db) < max(rain_db) <= RAIN_DB[1]
-    # Nothing is drawn unless it is asked for.
+    # Nothing is drawn unless requested.
     assert StreamSettings(site("SA1"), 1.0).drawn_preset == streams[0].preset
     assert StreamSettings(site("SA1"), 1.0).rain_db is None
 

@@ -4,14 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from smoothing_problem import (
-    HOP_NS,
-    HOP_S,
-    PRIOR,
-    heard_then_seen,
-    hidden_errors_m,
-    slots_of_a_street,
-)
+from smoothing_problem import HOP_NS, HOP_S, PRIOR, heard_then_seen, hidden_errors_m, slots_of_a_street
 
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.measurement import Bearing, Position
@@ -72,7 +65,7 @@ def test_late_observations_equal_those_in_order(own_state, within_m):
         smoother = FixedLagSmoother(EXACT)
         smoother.begin("car", 0, PRIOR)
         for hop in range(len(observations) + late_hops):
-            # Bearings in order, where the states come from them; the rest of every other hop some hops late.
+            # Bearings in order, which create the states; the rest of every second hop some hops late.
             if hop < len(observations) and (own_state or hop % 2 == 0):
                 bearings = [one for one in observations[hop] if isinstance(one, Bearing)]
                 smoother.update(hop * HOP_NS, {"car": bearings})
@@ -81,7 +74,7 @@ def test_late_observations_equal_those_in_order(own_state, within_m):
                 smoother.update(at * HOP_NS, {"car": observations[at][1:]})
         tracks.append(smoother.track("car"))
     ordered, late = tracks
-    # Without a state of its own, in order or not, it hangs on one beside it at constant velocity.
+    # Without a state of its own it uses the adjacent one at constant velocity, in order or not.
     both, places = np.intersect1d(ordered.stamps_ns, late.stamps_ns), []
     for one in tracks:
         places.append(one.states[np.isin(one.stamps_ns, both), :2][:-4])
@@ -110,7 +103,7 @@ def test_an_entity_without_observations_beyond_the_lag_restarts():
 
 @pytest.mark.long
 def test_entities_with_heights_come_and_go():
-    # At the 581st step a height that had outlived its states was refused by gtsam.
+    # At step 581 gtsam refused a height that had outlived its states.
     assert slots_of_a_street(620, np.random.default_rng(0)) > 0
 
 
@@ -126,7 +119,7 @@ def test_an_outlier_among_bearings_costs_little():
 
 
 def test_braking_in_view_does_not_change_the_hidden_phase():
-    # Hidden for 2.5 s at 8 m/s, then seen, and at a walk from 2.8 s on.
+    # Hidden for 2.5 s at 8 m/s, then in view, and at a walk from 2.8 s on.
     rng, time_s = np.random.default_rng(0), np.arange(45) * 0.1
     true_y = 26.0 - np.concatenate([[0.0], np.cumsum(np.where(time_s < 2.8, 0.8, 0.05))[:-1]])
     noise_m, noise_rad = rng.normal(0.0, 0.6, 45), rng.normal(0.0, 0.01, 45)
@@ -164,7 +157,7 @@ def test_first_sight_is_the_passing_of_the_edge(side):
     smoother, rng = FixedLagSmoother(), np.random.default_rng(2)
     edge_rad, errors_s = side * math.atan2(3.0, 5.0), []
     for number in range(4):
-        # Passes the edge's line of sight, y = 4.8 at x = 8, after 1.8 s.
+        # Passes the line of sight of the edge, y = 4.8 at x = 8, after 1.8 s.
         start = 30_000_000_000 * number
         for hop in range(45):
             y = 12.0 - 0.4 * hop

@@ -1,4 +1,4 @@
-"""Offset and yaw of a camera, from made-up passes, and from rendered ones that were moved."""
+"""Offset and yaw of a camera from synthetic and rendered passes."""
 
 import json
 import math
@@ -18,14 +18,14 @@ STREET_M, PACE_MPS = 10.0, 7.0
 
 
 def azimuth(time_s: np.ndarray, side: int) -> np.ndarray:
-    """Return the azimuth of a vehicle that comes from a side and is ahead at 0 s."""
+    """Return the azimuth of a vehicle from a side that is ahead at 0 s."""
     return np.arctan2(-side * PACE_MPS * time_s, STREET_M)
 
 
 def passes(
     n: int, offset_s: float, yaw_deg: float, *, std_deg: float = 3.0, other: float = 0.3, sides=(1, -1)
 ) -> list[HeardPass]:
-    """Return passes whose camera needs this offset and yaw: stamps are too early, azimuths too low."""
+    """Return passes of a camera with this offset and yaw: stamps too early, azimuths too low."""
     rng = np.random.default_rng(7)
     found = []
     for number in range(n):
@@ -43,7 +43,7 @@ def passes(
 @pytest.mark.parametrize(
     ("offset_s", "yaw_deg"), [(0.0, 0.0), (0.234, 3.3), (-0.45, -8.1), (0.81, 0.0), (-0.05, 12.0)]
 )
-def test_offset_and_yaw_are_found_among_reflections(offset_s, yaw_deg):
+def test_offset_and_yaw_are_estimated_despite_reflections(offset_s, yaw_deg):
     found = align(passes(20, offset_s, yaw_deg))
     assert found.offset_s == pytest.approx(offset_s, abs=0.02)
     assert found.yaw_deg == pytest.approx(yaw_deg, abs=0.8)
@@ -52,7 +52,7 @@ def test_offset_and_yaw_are_found_among_reflections(offset_s, yaw_deg):
     assert 1.0 < found.median_error_deg < 3.5
 
 
-def test_intervals_hold_the_truth_and_narrow_with_passes():
+def test_intervals_contain_the_truth_and_narrow_with_passes():
     few, many = (align(passes(n, 0.2, 3.0)) for n in (6, 40))
     for found in (few, many):
         (low_s, high_s), (low_deg, high_deg) = found.offset_interval_s, found.yaw_interval_deg
@@ -70,7 +70,7 @@ def test_vehicles_from_one_side_are_not_enough(sides, said):
         align(passes(12, 0.1, 2.0, sides=sides))
 
 
-def test_too_few_and_too_far():
+def test_too_few_passes_and_a_large_offset_raise_an_error():
     with pytest.raises(InvalidArgumentError, match=r"expected at least 5 vehicles .* got 4"):
         align(passes(4, 0.0, 0.0))
     with pytest.raises(InvalidArgumentError, match="at its edge: correct it by hand first"):
@@ -89,7 +89,7 @@ def car(tmp_path):
     return path
 
 
-def test_the_command_writes_the_car_with_both_added(car, tmp_path, capsys, monkeypatch):
+def test_the_align_command_adds_offset_and_yaw_to_the_car_file(car, tmp_path, capsys, monkeypatch):
     sounds = [tmp_path / f"{number}.wav" for number in range(10)]
     for sound in sounds:
         soundfile.write(sound, np.random.default_rng(0).normal(0.0, 0.1, (9_000, 3)), 8_000)
@@ -98,17 +98,7 @@ def test_the_command_writes_the_car_with_both_added(car, tmp_path, capsys, monke
         "worldstate.operations.alignment.camera_alignment.heard_passes", lambda source, margin_s: [next(seen)]
     )
     out = tmp_path / "aligned.json"
-    words = [
-        "array",
-        "align",
-        *map(str, sounds),
-        "--car",
-        str(car),
-        "--camera",
-        "left",
-        "--out",
-        str(out),
-    ]
+    words = ["array", "align", *map(str, sounds), "--car", str(car), "--camera", "left", "--out", str(out)]
     assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["recordings"], found["passes"]) == (10, 10)
@@ -130,7 +120,7 @@ def test_the_array_file_must_exist_beside_the_new_car_file(tmp_path):
         write_aligned(path, tmp_path / "elsewhere" / "new.json", None, 0.1, 2.0)
 
 
-def test_what_cannot_be_aligned(car, tmp_path, capsys):
+def test_recordings_that_cannot_be_aligned_raise_an_error(car, tmp_path, capsys):
     assert main(["array", "align", "nowhere"]) == 2
     assert "nowhere: expected a data set" in capsys.readouterr().err
     assert main(["array", "align", str(tmp_path), "--out", str(tmp_path / "new.json")]) == 2
@@ -149,7 +139,7 @@ def test_a_recording_without_a_camera_has_no_passes(tmp_path):
 
 
 @pytest.mark.slow
-def test_rendered_streets_give_the_offset_and_the_yaw_that_were_put_in(tmp_path):
+def test_rendered_streets_give_the_true_offset_and_yaw(tmp_path):
     for site, seed in (("SA1", 3), ("SB2", 3)):
         words = ["--minutes", "4", "--site", site, "--traffic", "approaches", "--bandwidth", "2000"]
         assert main(["sim", "make", "--out", str(tmp_path), *words, "--seed", str(seed)]) == 0

@@ -1,4 +1,4 @@
-"""A vehicle in one file: turned arrays, several cameras, clocks, and a message for every wrong field."""
+"""Car files: rotated arrays, several cameras, clocks and errors of fields."""
 
 import json
 import math
@@ -36,21 +36,21 @@ def written(folder: Path, car: object) -> Path:
 
 
 @pytest.mark.parametrize("angles", [(30.0, -12.0, 5.0), (-170.0, 80.0, -179.0), (0.0, 0.0, 90.0)])
-def test_a_mounting_turns_as_scipy_does(angles):
+def test_rotations_of_a_mounting_equal_scipy(angles):
     yaw, pitch, roll = angles
     turned = Rotation.from_euler("ZYX", [yaw, -pitch, roll], degrees=True).apply(RINGS)
     mounted = Mounting((1.0, 2.0, 3.0), yaw, pitch, roll).applied(RINGS)
     np.testing.assert_allclose(mounted, turned + np.array([1.0, 2.0, 3.0]), atol=1e-12)
 
 
-def test_a_camera_that_looks_up_and_an_array_that_does_turn_alike(tmp_path):
-    # What lies ahead of a sensor that is pitched up lies above the vehicle.
+def test_pitch_turns_camera_and_array_alike(tmp_path):
+    # A point ahead of a sensor with positive pitch is above the vehicle.
     assert Mounting(pitch_deg=20.0).applied([[1.0, 0.0, 0.0]])[0, 2] > 0.0
     lens = written(tmp_path, LENS | {"pitch_deg": 20.0, "position_m": [0, 0, 0]})
     assert read_camera(lens).pitch_rad > 0.0
 
 
-def test_a_tilted_array_in_space_hears_azimuths_of_the_vehicle(tmp_path):
+def test_bearings_of_a_tilted_array_are_in_vehicle_axes(tmp_path):
     array = read_car(written(tmp_path, CAR)).array
     rate, azimuth = 16_000, math.radians(50.0)
     spectrum = np.fft.rfft(np.random.default_rng(2).standard_normal(2 * rate))
@@ -74,7 +74,7 @@ def test_cameras_have_names_and_positions_relative_to_the_array(tmp_path):
         car.camera("rear")
 
 
-def test_the_array_may_stand_in_a_file_beside(tmp_path):
+def test_the_array_may_be_in_a_file_beside(tmp_path):
     (tmp_path / "mics.csv").write_text("\n".join(",".join(map(str, row)) for row in RINGS.tolist()))
     beside = {"array": {"file": "mics.csv"} | {k: v for k, v in ARRAY.items() if k != "positions_m"}}
     inline = read_car(written(tmp_path, CAR)).array
@@ -108,13 +108,13 @@ def changed(part: str, **keys: object) -> object:
         (changed("front", roll_deg=90.0), r"car.cameras\[0\]: camera.roll_deg: expected a number in \(-90"),
     ],
 )
-def test_every_wrong_field_is_named(tmp_path, car, said):
+def test_errors_of_a_car_file_name_the_field(tmp_path, car, said):
     with pytest.raises(InputFileError, match=said) as refused:
         read_car(written(tmp_path, car))
     assert "car.json" in str(refused.value)
 
 
-def test_the_offset_moves_the_looks_on_the_clock_of_the_sound(tmp_path):
+def test_the_stamp_offset_shifts_the_looks(tmp_path):
     soundfile.write(
         tmp_path / "street.wav", np.random.default_rng(0).uniform(-0.01, 0.01, (24_000, 10)), 16_000
     )
@@ -133,7 +133,7 @@ def test_the_offset_moves_the_looks_on_the_clock_of_the_sound(tmp_path):
     assert channel.last_look(1_300_000_000).stamp_ns == 1_250_000_000
 
 
-def test_run_and_live_take_the_car_in_place_of_array_and_camera(tmp_path, capsys):
+def test_run_and_live_accept_a_car_file(tmp_path, capsys):
     noise = np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10))
     soundfile.write(tmp_path / "street.wav", noise, 16_000)
     car, sound = str(written(tmp_path, CAR)), str(tmp_path / "street.wav")
@@ -144,8 +144,8 @@ def test_run_and_live_take_the_car_in_place_of_array_and_camera(tmp_path, capsys
     assert json.loads(capsys.readouterr().out)["array"] == heard["array"]
 
 
-def test_a_car_file_alone_carries_all_that_a_vehicle_has(tmp_path):
-    """Array, boxes of two cameras, motion, engine and model: the same states as by single options."""
+def test_a_car_file_equals_single_options(tmp_path):
+    """Array, boxes of two cameras, motion, engine and model give the states of single options."""
     soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
     (tmp_path / "moves.csv").write_text("time_s,speed_mps\n0,3\n9,3\n")
     save_model(tmp_path / "mine.json", read_model())
@@ -176,7 +176,7 @@ def test_a_car_file_alone_carries_all_that_a_vehicle_has(tmp_path):
         ),
     ],
 )
-def test_options_that_say_two_things(tmp_path, capsys, words, said):
+def test_options_that_contradict_the_car_file_raise_an_error(tmp_path, capsys, words, said):
     assert main(["run", "street.wav", "--car", str(written(tmp_path, CAR)), *words]) == 2
     assert said in capsys.readouterr().err
 
@@ -189,8 +189,8 @@ def boxes(folder: Path, name: str, columns_px: list[float]) -> str:
     return f"{name}={path}"
 
 
-def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path):
-    """Where both see it: left in the image of the front camera, right in that of the left one."""
+def test_boxes_of_two_cameras_become_one_vehicle(tmp_path):
+    """The vehicle is left in the image of the front camera and right in that of the left one."""
     soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
     wide = [FRONT | {"horizontal_fov_deg": 90.0}, LEFT | {"horizontal_fov_deg": 90.0}]
     car, out = written(tmp_path, CAR | {"cameras": wide}), tmp_path / "states.jsonl"
@@ -216,14 +216,11 @@ def test_run_asks_all_cameras_of_a_car_and_boxes_of_one_vehicle_are_one(tmp_path
             ["--car", "CAR", "--detections", "left=a", "--detections", "left=b"],
             "--detections: expected different names, got left=a left=b",
         ),
-        (
-            ["--car", "CAR", "--detections", "rear=a.json"],
-            "camera: expected one of front, left, got 'rear'",
-        ),
+        (["--car", "CAR", "--detections", "rear=a.json"], "camera: expected one of front, left, got 'rear'"),
         (["--car", "CAR", "--detections", "left=a.json"], "a.json"),
     ],
 )
-def test_what_is_wrong_with_the_boxes_of_several_cameras_is_said(tmp_path, capsys, words, said):
+def test_wrong_boxes_of_several_cameras_raise_an_error(tmp_path, capsys, words, said):
     soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
     car = str(written(tmp_path, CAR))
     given = [car if word == "CAR" else word for word in words]

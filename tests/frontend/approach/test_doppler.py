@@ -7,11 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
 
-from worldstate.frontend.approach.doppler import (
-    RadialSpeed,
-    radial_speed,
-    radial_speed_m_s,
-)
+from worldstate.frontend.approach.doppler import RadialSpeed, radial_speed, radial_speed_m_s
 from worldstate.frontend.approach.engine_line import HarmonicTrack, track_fundamental
 from worldstate.ground.values import NotUsable
 
@@ -196,12 +192,7 @@ def test_sample_rate_and_gain_do_not_matter():
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    time=st.floats(-5, 5),
-    speed=st.floats(0.5, 50),
-    closest=st.floats(-2, 2),
-    distance=st.floats(0.5, 50),
-)
+@given(time=st.floats(-5, 5), speed=st.floats(0.5, 50), closest=st.floats(-2, 2), distance=st.floats(0.5, 50))
 def test_closed_form_emission_time_equals_root_finding(time, speed, closest, distance):
     def late(tau):
         return tau + np.hypot(distance, speed * (tau - closest)) / SOUND_M_S - time

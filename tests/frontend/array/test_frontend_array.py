@@ -36,11 +36,7 @@ def test_left_source_reaches_the_left_microphone_first() -> None:
 def test_far_field_delay_is_the_limit_of_distance(azimuth: float, elevation: float, seed: int) -> None:
     positions = np.random.default_rng(seed).normal(size=(5, 3))
     source = 1e7 * np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )
     travel = (np.linalg.norm(source - positions, axis=1) - 1e7) / 343.0
     np.testing.assert_allclose(MicrophoneArray(positions).delays_s(azimuth, elevation), travel, atol=1e-8)
