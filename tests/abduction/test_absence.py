@@ -53,7 +53,7 @@ def test_reads_back_what_it_wrote(table):
     assert decode(MissRateTable, json.loads(json.dumps(encode(table))), "file") == table
 
 
-def test_the_default_is_what_the_paper_measured():
+def test_the_default_is_the_measurement_of_the_paper():
     table = default_miss_rates()
     assert table(0.0) == pytest.approx(0.04)
     assert table(np.radians(25)) == pytest.approx(0.14)

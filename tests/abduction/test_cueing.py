@@ -67,7 +67,7 @@ def test_consecutive_hops_do_not_cross_recordings():
 
 
 @pytest.mark.parametrize("risk_map", [IsotonicMap((0.1, 0.9), (0.0, 1.0)), PlattMap(-2.0, 0.3)])
-def test_a_policy_reads_back_what_it_wrote(risk_map):
+def test_a_policy_reads_back_as_written(risk_map):
     policy = CueingPolicy(0.78, 3, 0.02, PRIOR, risk_map, 1.0)
     assert decode(CueingPolicy, encode(policy), "file") == policy
 

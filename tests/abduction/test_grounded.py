@@ -31,7 +31,7 @@ def seen(**signature):
     return GroundedObservation(signature={name: Observable(*value) for name, value in signature.items()})
 
 
-def test_without_measurements_the_classifier_s_evidence_passes_unchanged():
+def test_without_measurements_the_evidence_is_unchanged():
     answer = ground(SCORES, GroundedObservation(), [car(), motorcycle()])
     np.testing.assert_allclose(answer.evidence.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
     assert answer.class_posterior == pytest.approx({"motor_vehicle": 0.9, "motorcycle": 0.1})
@@ -93,7 +93,7 @@ def test_each_coupling_can_be_switched_off_and_matters_when_on(name):
     np.testing.assert_allclose(none.evidence.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
 
 
-def test_observables_that_contradict_each_other_are_less_likely_than_those_that_agree():
+def test_contradicting_observables_are_less_likely():
     speed = 10.0
     spacing, shape = (float(c.expected([speed])[0, 0]) for c in (engine_line(), tyre_noise_shape()))
     agreeing = seen(line_spacing_hz=(spacing, 1.0), tyre_shape_db=(shape, 1.0), doppler_ratio=(1.060, 0.002))

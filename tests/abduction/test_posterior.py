@@ -86,7 +86,7 @@ def test_lambda_does_not_depend_on_how_probable_a_hidden_source_is(scene, answer
 
 
 @given(scenes(scale=8, directions=2), open_unit, open_unit)
-def test_the_statistic_falls_as_the_channel_goes_blind(scene, beta, other):
+def test_the_statistic_falls_with_the_miss_rate(scene, beta, other):
     prior, evidence = scene
     sharp, dull = sorted((beta, other))
     assert statistic(evidence, Absent(sharp), prior) >= statistic(evidence, Absent(dull), prior) - 1e-12

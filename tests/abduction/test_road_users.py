@@ -50,7 +50,7 @@ def test_the_likeliest_set_is_minimal_and_a_siren_keeps_its_odds(
     assert np.log(heard["siren"] / (1.0 - heard["siren"])) == pytest.approx(log_odds)
 
 
-def test_a_model_file_keeps_it_and_refuses_what_does_not_fit(tmp_path: Path) -> None:
+def test_a_model_file_keeps_the_guard_and_wrong_ones_raise_an_error(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     save_model(path, replace(read_model(), road_users=model()))
     again = read_model(path).road_users

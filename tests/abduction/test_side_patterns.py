@@ -119,7 +119,7 @@ def told_of(listener: StreetListener, rng: np.random.Generator, slope: float, ho
     return float(groups[0, 3])
 
 
-def test_hand_overs_teach_the_side_and_a_checkpoint_continues_bit_for_bit():
+def test_hand_overs_teach_the_side_and_checkpoints_continue_exactly():
     rng = np.random.default_rng(8)
     listener = StreetListener(StreetHearing(SidePatterns("roof")))
     for arm, slope in (("left", 0.5), ("right", -0.5)) * 3:

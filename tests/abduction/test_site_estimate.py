@@ -73,7 +73,7 @@ def test_the_mirrored_street_mirrors_the_reference(model):
     np.testing.assert_allclose(mirror_features(there[None], 6)[0], back, atol=1e-9)
 
 
-def test_a_checkpoint_goes_on_to_the_bit(model):
+def test_a_checkpoint_continues_exactly(model):
     windows = np.random.default_rng(2).uniform(0.1, 1.0, (20, 60))
     first, whole = SiteSignature(model), SiteSignature(model)
     for window in windows[:10]:

@@ -221,7 +221,7 @@ def test_a_board_is_known_by_its_name(name: str, microphones: int, radius_m: flo
     assert name in str(add_array_options.__doc__)
 
 
-def test_a_square_board_faces_forward_and_its_first_microphone_is_below_to_the_right() -> None:
+def test_the_first_microphone_of_a_square_board_is_below_right() -> None:
     array = read_array("uma-16")
     assert (array.n_microphones, array.ambiguity, array.channels) == (16, "front-back", ())
     np.testing.assert_allclose(array.aperture_m, [0.0, 0.126, 0.126])

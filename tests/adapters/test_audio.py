@@ -93,7 +93,7 @@ def test_refuses_empty_blocks(long_file: Path, frames: int) -> None:
         next(source.blocks(frames))
 
 
-def test_a_silent_file_among_those_of_single_microphones_is_a_silent_channel(tmp_path: Path) -> None:
+def test_a_silent_file_of_one_microphone_is_a_silent_channel(tmp_path: Path) -> None:
     samples = noise(channels=4)
     samples[:, 2] = 0.0
     files = tuple(write(tmp_path / f"{k}.wav", samples[:, k]) for k in range(4))

@@ -92,7 +92,7 @@ def test_behind_the_camera_is_in_no_column() -> None:
 
 
 @given(left=st.floats(0.0, 1800.0), width=st.floats(1.0, 130.0))
-def test_a_sighting_lies_between_the_edges_of_its_box(left: float, width: float) -> None:
+def test_a_sighting_is_between_the_edges_of_its_box(left: float, width: float) -> None:
     camera = PinholeCamera.ovad()
     seen = camera.sighting((left, 400, left + width, 700), "car", 0.9)
     assert camera.azimuth(left + width) < seen.azimuth_rad < camera.azimuth(left)

@@ -29,7 +29,7 @@ def write(path: Path, rows: list[dict[str, Any]]) -> Path:
     return path
 
 
-def test_reads_what_was_written(tmp_path: Path) -> None:
+def test_detections_read_back_as_written(tmp_path: Path) -> None:
     rows = [row([[1, 2, 30.5, 140]], [0.9], ["car"]), row([], [], [], classes=[])]
     log = read_detections(write(tmp_path / "d.json", rows))
     assert len(log) == 2

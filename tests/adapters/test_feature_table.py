@@ -32,7 +32,7 @@ def table(tmp_path):
     return read_features(write(tmp_path / "f.csv", good_rows()))
 
 
-def test_reads_what_is_there(table):
+def test_a_feature_table_is_read(table):
     assert len(table) == 4
     assert table.features[1, 2] == pytest.approx(1.02)
     assert table.t0_frames == (None, 70, 70, 55)

@@ -118,7 +118,7 @@ def test_a_model_ships_for_every_board_and_is_used_at_once(name: str) -> None:
     assert last.no_sequence is None and "uncalibrated" not in why_not(last)
 
 
-def test_a_model_for_the_roof_array_ships_that_learned_no_windows_of_a_data_set() -> None:
+def test_the_shipped_roof_model_learned_no_windows_of_a_data_set() -> None:
     """It replaces the usual model if the licence of OVAD's windows is not acceptable."""
     free, usual = read_model("simulated-56"), read_model()
     assert free.domain is not None and usual.domain is not None
@@ -354,9 +354,7 @@ def test_another_channel_order_is_logged_and_gives_the_same_bearings(
 
 
 @pytest.mark.long
-def test_a_recordings_own_array_gives_the_bearings_of_the_same_one_passed(
-    tmp_path: Path, approach: Approach
-) -> None:
+def test_the_array_of_a_recording_equals_the_same_one_passed(tmp_path: Path, approach: Approach) -> None:
     """In a data set with an array file and in OVAD's layout without one."""
     bare = tmp_path / "SA1" / "left" / "1_00_0002"
     bare.mkdir(parents=True)

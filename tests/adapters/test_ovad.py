@@ -39,7 +39,7 @@ def write_detections(folder: Path, name: str) -> None:
     (folder / name).write_text(json.dumps({"detections_per_frame": [row]}))
 
 
-def test_lists_what_the_log_lists(tmp_path: Path) -> None:
+def test_recordings_are_those_of_the_log(tmp_path: Path) -> None:
     left, none, right = OvadDataset(write_log(tmp_path, *ROWS)).recordings
     assert (left.recording_id, left.label) == ("1_00_0002", "left")
     assert left.moving_ego is False

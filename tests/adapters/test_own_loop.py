@@ -31,7 +31,7 @@ def test_the_example_hands_over_a_hidden_vehicle(own_loop):
     assert seen.azimuth_rad == pytest.approx(own_loop.azimuth_at(4.5), abs=0.03)
 
 
-def test_it_prints_states(own_loop, capsys):
+def test_the_example_prints_states(own_loop, capsys):
     own_loop.main()
     lines = capsys.readouterr().out.splitlines()
     assert "hidden at +" in lines[4]

@@ -127,7 +127,7 @@ def test_belief_propagation_is_near_the_sum_over_all_events(log_ratios):
     assert (near.sum(axis=0) <= 1.0 + 1e-9).all() and (near.sum(axis=1) <= 1.0 + 2e-3).all()
 
 
-def test_a_crowd_uses_the_likeliest_event_for_states_and_all_events_for_existence():
+def test_a_crowd_uses_the_likeliest_event_and_all_for_existence():
     crowd = np.full((8, 8), -2.0) + 6.0 * np.eye(8)
     found = joint_association(crowd, np.ones(8, bool))
     assert found.found == {i: i for i in range(8)}

@@ -56,7 +56,7 @@ def eq_6(priors: tuple[float, ...], values: tuple[float, ...]) -> np.ndarray:
 @pytest.mark.parametrize("k", [1, 2, 3])
 @given(chances, st.data())
 @settings(max_examples=8, deadline=None)
-def test_a_single_window_gives_eq_6_whatever_came_before(
+def test_a_window_gives_eq_6_after_any_past(
     k: int, priors: tuple[float, float, float], data: st.DataObject
 ) -> None:
     world, stamp_ns = street(k, priors=Priors(*priors)), 0

@@ -589,7 +589,7 @@ def test_a_checkpoint_continues_bit_for_bit(script, cut):
     assert [s.to_json() for s in got] == [s.to_json() for s in expected]
 
 
-def test_a_measurement_of_other_directions_is_refused_and_changes_nothing():
+def test_a_measurement_of_other_directions_raises_an_error_without_effect():
     world = start().update(measured(2.0, LEFT))
     before, other = world.state, SignatureEvidence(("north",), (0.0,), 0.0, 0.0)
     with pytest.raises(InvalidArgumentError, match="expected one of the directions"):

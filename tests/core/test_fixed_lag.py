@@ -175,7 +175,7 @@ def test_the_filter_continues_two_seconds_after_a_clock_is_set_back() -> None:
 
 @given(SEEDS, st.integers(1, 25), st.floats(2.2, 1e9) | st.floats(2.2, 4.0), st.booleans(), st.booleans())
 @settings(max_examples=6)
-def test_one_stray_stamp_changes_nothing_after_it(
+def test_one_stray_stamp_has_no_later_effect(
     seed: int, at: int, ahead_s: float, again: bool, clocked: bool
 ) -> None:
     in_order = script(np.random.default_rng(seed), hops=30)

@@ -85,7 +85,7 @@ def test_every_snapshot_obeys_the_laws(sequence: bool, seed: int) -> None:
 
 @given(SEEDS)
 @settings(max_examples=6, deadline=None)
-def test_an_alarm_depends_on_time_not_on_how_many_measurements_carry_it(seed: int) -> None:
+def test_an_alarm_does_not_depend_on_the_measurement_rate(seed: int) -> None:
     """Add empty messages, odometry, a source without evidence and a blind camera at and between hops.
 
     The looks of that camera enter the mean that decides; the last one of each hop counts.

@@ -253,7 +253,7 @@ def test_messages_on_both_sides_raise_both_advisories() -> None:
         assert not any(cue.advisory for cue in world.predict(1.2).state.cues)
 
 
-def test_an_announced_vehicle_keeps_its_identity_when_camera_or_radar_find_it() -> None:
+def test_an_announced_vehicle_keeps_its_identity_when_detected() -> None:
     announced = after(*[radio(hop / 10, crossing(hop / 10)) for hop in range(1, 42)])
     (before,) = announced.state.entities
     for sensor in ("camera", "radar"):
@@ -453,7 +453,7 @@ def test_the_risk_falls_smoothly_with_the_uncertainty_of_speed() -> None:
 
 @pytest.mark.parametrize("speed_mps", [0.0, 2.0, 5.0, 8.3])
 @pytest.mark.parametrize("told_by", ["context", "odometry"])
-def test_the_line_of_sight_turns_as_the_ego_vehicle_drives_up_to_the_corner(speed_mps, told_by) -> None:
+def test_the_line_of_sight_turns_with_the_approach_to_the_corner(speed_mps, told_by) -> None:
     sides = corner_at("left", (30.0, 5.0), 34.0), corner_at("right", (30.0, -5.0), 34.0)
     start, corner, errors = np.array([[34.0, 22.0, 0.0, -4.0]]), np.array([[30.0, 5.0]]), []
     true_s = float(passed_s(start, corner, speed_mps, 0.001)[0])

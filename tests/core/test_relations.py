@@ -40,7 +40,7 @@ def seen(
 
 
 @given(st.floats(4.0, 40.0), st.floats(-6.0, 6.0))
-def test_the_chance_to_be_in_the_lane_of_the_ego_vehicle_is_that_of_draws(x: float, y: float) -> None:
+def test_the_probability_of_the_own_lane_equals_the_share_of_draws(x: float, y: float) -> None:
     told = seen((x, y, 5.0, 0.0))
     rng = np.random.default_rng(0)
     draws = rng.normal((x, y), STD[:2], (20_000, 2))

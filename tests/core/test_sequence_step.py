@@ -192,7 +192,7 @@ def test_the_alarm_equals_that_of_the_stream_of_beliefs(seed: int) -> None:
     assert all(cue.alpha is None for cue in worlds[-1].state.cues)
 
 
-def test_the_alarm_is_held_for_a_second_whatever_the_hop() -> None:
+def test_the_alarm_is_held_for_a_second_at_any_hop() -> None:
     said = drawn(np.random.default_rng(3), 1, SequenceAlarm(2.0, 15.0))[0]
     chances = np.full((2, 2, len(GROUPS)), 1e-6)
     chances[0, 0, 0], chances[0, 1, -1], chances[1, :, -1] = 1.0, 1.0, 1.0

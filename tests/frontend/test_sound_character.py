@@ -68,7 +68,7 @@ def test_a_tone_is_a_line_at_its_pitch(pitch_hz: float, seed: int) -> None:
         assert found[f"steady {part}"] > max(others) + 2.0
 
 
-def test_a_comb_of_harmonics_stands_out_of_noise() -> None:
+def test_a_comb_of_harmonics_exceeds_noise() -> None:
     pulses = np.zeros(int(SECONDS * RATE))
     pulses[:: int(RATE / 150)] = 1.0
     assert heard(pulses + 0.05 * noise())["comb"] > heard(noise())["comb"] + 0.4

@@ -199,7 +199,7 @@ def test_without_a_model_the_sentence_has_no_risk(states):
     assert said == "A sound comes from 29 degrees right; no risk can be stated."
 
 
-def test_sound_is_a_reflection_while_a_vehicle_is_hidden_and_none_is_in_view_there(states):
+def test_sound_without_a_visible_vehicle_is_a_reflection(states):
     hidden, in_view = states[0], states[-1]
     assert hidden.left.advisory and in_view.left.advisory
     sound = {"bearing": Bearing(-1.0, 0.1, 2.0)}

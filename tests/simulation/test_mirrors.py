@@ -80,7 +80,7 @@ def test_paths_are_reciprocal(plan, ahead, y, own_x, own_y) -> None:
 
 @given(plans, st.floats(8.0, 60.0))
 @settings(max_examples=20, deadline=None)
-def test_the_direct_path_has_weight_one_in_view_and_zero_behind_the_corner(plan, y) -> None:
+def test_the_direct_path_has_weight_one_only_in_view(plan, y) -> None:
     """The tolerance excludes the transition at the edge of the shadow."""
     images, lane = trace(drawn_fronts(plan), EAR), plan.lanes_m[0]
     (right, left), direct = plan.sight_m(lane), images.order == 0

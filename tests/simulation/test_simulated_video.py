@@ -310,7 +310,7 @@ def test_the_video_is_written_beside_the_sound_reproducibly(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_data_set_with_video_has_the_same_sound_for_any_number_of_jobs(tmp_path):
+def test_sound_beside_video_does_not_depend_on_the_number_of_jobs(tmp_path):
     for name, video, jobs in (("a", True, 1), ("b", True, 2), ("c", False, 1)):
         wanted = DatasetSettings(n_static=2, seed=5, duration_s=0.5, video=video)
         write_dataset(tmp_path / name, wanted, jobs=jobs)

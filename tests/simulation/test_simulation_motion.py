@@ -161,7 +161,7 @@ def test_paths_of_a_moving_ego_change_without_clicks(name):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SHOWN)
-def test_energy_is_continuous_through_the_whole_recording_and_line_of_sight_entry(name):
+def test_energy_of_a_moving_ego_is_continuous(name):
     """Noise in windows of 50 ms: no step beyond what 50 ms of movement and chance make, and no gap."""
     power = (heard(SCENES[name](), noise).reshape(200, -1) ** 2).mean(axis=1)
     # Behind a rigid wedge the level of a vehicle near the mouth rises by 20 dB within 0.3 s.

@@ -209,7 +209,7 @@ def test_line_of_sight_is_the_straight_line_past_the_corner():
 
 
 @pytest.mark.long
-def test_a_data_set_has_the_layout_and_the_same_bytes_for_any_number_of_jobs(tmp_path):
+def test_a_data_set_has_its_layout_for_any_number_of_jobs(tmp_path):
     """Two of a standing ego, one of a moving one; OVAD has no camera results of the latter."""
     wanted = DatasetSettings(n_static=2, n_dynamic=1, seed=5, duration_s=0.5, kind="bicycle")
     rows = write_dataset(tmp_path / "one", wanted, array=PAIR)

@@ -162,7 +162,7 @@ def test_disagreeing_harmonics_are_refused():
     assert "disagree" in radial_speed(inharmonic).reason
 
 
-def test_harmonic_misfit_tells_a_comb_from_an_inharmonic_mixture():
+def test_harmonic_misfit_separates_a_comb_from_a_mixture():
     rng, t = np.random.default_rng(2), np.arange(16_000) / RATE
     comb = engine(2 * np.pi * 60 * t, 5) + 0.5 * rng.normal(size=t.size)
     mixture = sum(np.cos(2 * np.pi * f * t) for f in (60.0, 121.3, 178.4)) + 0.5 * rng.normal(size=t.size)

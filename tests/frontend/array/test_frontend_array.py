@@ -63,7 +63,7 @@ def test_a_planar_array_has_equal_steering_front_and_back() -> None:
 
 
 @given(st.integers(2, 9), st.integers(0, 2**32 - 1), st.floats(0.0, 3.0), st.data())
-def test_two_microphones_at_one_place_are_refused_by_their_numbers(n, seed, in_least, data) -> None:
+def test_microphones_at_one_place_raise_an_error_with_their_numbers(n, seed, in_least, data) -> None:
     """All other microphones are 1 m apart."""
     places = np.random.default_rng(seed).permutation(n)[:, None] * [0.0, 1.0, 0.0]
     first, second = sorted(data.draw(st.lists(st.integers(0, n - 1), min_size=2, max_size=2, unique=True)))

@@ -58,7 +58,7 @@ def test_whole_window_equals_the_plain_formula() -> None:
     np.testing.assert_allclose(published_feature(window, array, RATE), plain, rtol=1e-4)
 
 
-def test_stream_equals_the_plain_formula_on_the_frames_that_end_in_each_half() -> None:
+def test_a_stream_equals_the_plain_formula_per_half() -> None:
     array = small_array()
     sound = street(array, 1, seconds=1.3)
     frame = FrontEnd(array, RATE).process(sound)[2]

@@ -191,7 +191,7 @@ HEXAGON = ring(6, 0.0463)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_three_plane_waves_give_the_positions_whatever_those_given_are(seed: int) -> None:
+def test_three_plane_waves_give_the_positions_from_any_start(seed: int) -> None:
     rng = np.random.default_rng(seed)
     there = rng.permutation(HEXAGON) if seed else HEXAGON
     turn = rng.uniform(-180.0, 180.0)
@@ -247,7 +247,7 @@ def test_an_unusable_channel_keeps_its_position() -> None:
     assert found.explained > found.explained_before
 
 
-def test_what_cannot_be_fitted_is_refused(around: list[np.ndarray]) -> None:
+def test_insufficient_waves_raise_an_error(around: list[np.ndarray]) -> None:
     quiet = [np.zeros((4 * RATE, 4), np.float32)]
     with pytest.raises(InvalidArgumentError, match="2 s of coherent sound"):
         fitted(quiet, SQUARE)
