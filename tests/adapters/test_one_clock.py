@@ -20,7 +20,7 @@ from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, 
 from worldstate.adapters.files.odometry_file import OdometryLog, read_odometry
 from worldstate.adapters.listener import listened
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.errors import InputFileError
 from worldstate.ground.values import nanoseconds, seconds
 from worldstate.measurement import Bearing, Odometry
 

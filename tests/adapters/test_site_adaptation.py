@@ -1,6 +1,5 @@
 """Learning of a site in the running chain: option, checkpoints and effect on mostly empty streets."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
