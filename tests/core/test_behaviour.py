@@ -74,6 +74,13 @@ def test_a_sighting_outside_the_gate_is_another_vehicle(azimuth_rad, vehicles):
     assert len(after(world, measured(1.6, FRONT, car(azimuth_rad))).state.entities) == vehicles
 
 
+def test_sound_of_the_wrong_side_gives_way_to_the_sighting():
+    world = after(WorldFilter(), *[measured(t, LEFT) for t in (1.0, 2.0, 3.0)])
+    (hidden,) = world.state.entities
+    found = entities(after(world, measured(3.1, LEFT, car(-0.5))))
+    assert {status: entity.id for status, entity in found.items()} == {"visible": hidden.id}
+
+
 def test_a_missed_image_does_not_hide_a_vehicle():
     """One missed image is no occlusion, so hidden evidence is another vehicle."""
     first = [measured(1.0 + hop / 10, FRONT, car(-0.5)) for hop in range(15)]
