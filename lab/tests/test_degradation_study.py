@@ -31,22 +31,17 @@ from worldstate_lab.degradation.conditions import (
 )
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
 from worldstate_lab.degradation.staged_filter import (
-    STATES,
     by_condition,
     cameras,
     filter_in_conditions,
-    missed,
-    staged_advisories,
-    stream_sweep,
 )
 from worldstate_lab.evaluation.report.degradation_section import (
     degradation_record,
-    stream_table,
     sweep_tables,
 )
 from worldstate_lab.trials.pass_cache import Failed, PassCache, attempted
 
-from worldstate.abduction.co_evidence import Absent, default_miss_rates
+from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.camera.camera_channel import seen_in
 from worldstate.adapters.camera.camera_health import degrade, learn_health
@@ -56,7 +51,7 @@ from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
-from worldstate.adapters.listener import listen_steps, measure_steps
+from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import open_source
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
@@ -279,64 +274,6 @@ def test_the_chain_estimates_the_cameras_health_from_the_video_beside_the_sound(
     }
     assert np.median([b for t, b in betas.items() if t < 4_500_000_000]) < 0.4
     assert np.median([b for t, b in betas.items() if t > 5_500_000_000]) > 0.9
-
-
-@pytest.mark.long
-def test_a_degraded_camera_misses_at_the_rate_of_its_table_and_never_less():
-    box = DetectionFrame(np.array([[900.0, 500.0, 1000.0, 600.0]]), np.array([0.9]), ("car",))
-    log, table = DetectionLog.at_rate([box] * 2000, 10.0), default_miss_rates()
-    left = {
-        d: np.array(
-            [len(one.boxes_px) for one in missed(log, WHOLE, table, d, np.random.default_rng(1)).frames]
-        )
-        for d in (0.0, 0.5, 1.0)
-    }
-    assert left[0.0].all()
-    azimuth = WHOLE.sighting(box.boxes_px[0], "car", 0.9).azimuth_rad
-    for d in (0.5, 1.0):
-        # Share of the boxes of a clean camera; four standard errors of 2000 draws.
-        expected = (1.0 - table(azimuth, d)) / (1.0 - table(azimuth))
-        assert left[d].mean() == pytest.approx(expected, abs=4 * (expected / 2000) ** 0.5)
-    assert not (left[1.0] > left[0.5]).any()
-
-
-def test_advisories_of_a_state_are_compared_with_those_of_the_clean_camera():
-    hops = 6000
-    onsets = dict.fromkeys((state.name for state in STATES), range(0, hops, 600))
-    onsets["lens 1"], onsets["off"] = range(0, hops, 300), ()
-    rows = []
-    for name, first in onsets.items():
-        advised = np.zeros(hops, bool)
-        for hop in first:
-            advised[hop + 5 : hop + 20] = True
-        columns = {"condition": np.full(hops, name), "time_s": 0.1 * np.arange(hops), "advised": advised}
-        rows.append(HopTable(columns))
-    sweep = stream_sweep([joined(rows)] * 3, seed=0)
-    by_name = {row.name: row for row in sweep.rows}
-    assert sweep.hours == pytest.approx(0.5)
-    assert by_name[CLEAN].onsets == 30 and by_name[CLEAN].per_hour.value == pytest.approx(60.0)
-    # One onset per minute against two, in every minute: no draw of minutes changes the ratio.
-    assert by_name["lens 1"].ratio == pytest.approx((2.0, 2.0, 2.0))
-    assert by_name["off"].onsets == 0 and by_name["off"].upper_90 == pytest.approx(np.log(10.0) / 0.5)
-    assert any(
-        line.startswith("lens 1") and "2.00 [2.00, 2.00]" in " ".join(line.split())
-        for line in stream_table(sweep).lines()
-    )
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_a_clean_camera_on_a_stream_is_the_whole_chain(approach):
-    found = staged_advisories(approach.folder, None, 0)
-    names = found.condition.tolist()
-    assert list(dict.fromkeys(names)) == [state.name for state in STATES]
-    chain = [
-        any(cue.advisory for cue in step.state.cues) for step in listen_steps(open_source(approach.folder))
-    ]
-    assert any(chain)
-    assert found.advised[found.condition == CLEAN].tolist() == chain
-    # Noise on every microphone masks the vehicle.
-    assert found.advised[found.condition == "roof 1"].sum() < sum(chain)
 
 
 @pytest.mark.long

@@ -1,16 +1,14 @@
 """Ground truth of a stream: every vehicle at every tenth of a second."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
-from worldstate.ground import BoolArray, FloatArray, InputFileError
+from worldstate.ground import BoolArray, FloatArray
 from worldstate.simulation.camera.simulated_detector import (
     Frame,
     SimulatedDetection,
@@ -176,17 +174,6 @@ def describe_events(
         for levels in [loudness_db[number]]
     ]
     return {"vehicles": told, "sounds": others}
-
-
-def stream_hazards(folder: Path) -> int:
-    """Count the vehicles that come out of a hidden arm in a stream on disk; 0 if it is not simulated."""
-    path = folder / EVENTS_NAME
-    if not path.is_file():
-        return 0
-    try:
-        return sum(bool(one["hazard"]) for one in json.loads(path.read_text(encoding="utf-8"))["vehicles"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputFileError(path, f"expected the events of a simulated stream: {error!r}") from error
 
 
 def describe_stream(settings: StreamSettings, vehicles: Sequence[VehicleTruth]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,13 +14,11 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import coherence, welch
-from worldstate_lab.trials.trial import find_takes
 
 from worldstate.adapters.datasets.ovad import Recording, choose_array, read_true_tracks
 from worldstate.cli.main import main
 from worldstate.commissioning.heard_stream import junction_named
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation import preset, site
 from worldstate.simulation.scene.junction import drawn_site
@@ -278,16 +275,6 @@ def test_a_stream_on_disk_reads_as_a_recording(tmp_path: Path, capsys: pytest.Ca
         np.testing.assert_allclose([float(row["time_s"]) for row in own], track.time_s)
         np.testing.assert_array_equal([row["in_view"] == "1" for row in own], track.in_view)
         assert all((row["time_to_visible_s"] == "") == (event["t0_s"] is None) for row in own)
-    # It is no hazard-free time for an evaluation if any vehicle comes out of a hidden arm.
-    listed = tmp_path / "SB1" / "none" / "2_02_0000"
-    shutil.copytree(folder, listed)
-    (tmp_path / "DataLog.csv").write_text("ID,Environment,Class,T0\n2_02_0000,SB1,none,70\n")
-    with pytest.raises(InputFileError, match="1 vehicles that come out"):
-        find_takes(tmp_path, hazard_free=[folder])
-    quiet = {"vehicles": [event for event in events if not event["hazard"]], "sounds": []}
-    (folder / "events.json").write_text(json.dumps(quiet))
-    taken = find_takes(tmp_path, hazard_free=[folder]).static[-1]
-    assert (taken.path, taken.name, taken.hazard_free) == (folder, "SB1-busy-33", True)
 
 
 def test_the_stream_command_offers_all_traffic_and_reports_bad_options(

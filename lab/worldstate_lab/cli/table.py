@@ -19,9 +19,6 @@ Streets are kept, and OUT/cache has the results by the content of each recording
 continues, and a second one takes a minute. The minimum is two approaches and two hazard-free recordings, and
 for leaving junctions out two junctions with both; the requirements of a protocol are checked first.
 
---stage-streams also degrades camera and sound on the streams of --hazard-free, and prints advisories per hour
-in every state beside those of the clean camera, on the same minutes: half an hour for each hour.
-
 Unreadable recordings, and rows of a model for another array, are listed and not scored.
 
 Examples
@@ -29,32 +26,25 @@ Examples
   worldstate-lab table --smoke --out smoke
   worldstate-lab table --out streets --jobs 2
   worldstate-lab table ovad_dataset --features extracted_features.csv --out report --jobs 2
-  worldstate-lab table mine --hazard-free quiet_hour.wav --out report --against before
 """
 
 import argparse
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from worldstate.adapters.camera.detections import DetectionFilter
 from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_array
 from worldstate.adapters.files.array_match import microphone_order
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.own_parts import detector_maker, detector_name
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar, track
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.simulation.dataset.dataset import write_dataset
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES
-from worldstate_lab.degradation.conditions import StagedDetector, motion_detectors
+from worldstate_lab.degradation.conditions import motion_detectors
 from worldstate_lab.degradation.degradation_study import DegradationSettings
-from worldstate_lab.evaluation.against import Comparison, compare, save_scores
 from worldstate_lab.evaluation.evaluation import (
     Evaluation,
     EvaluationSettings,
@@ -66,7 +56,6 @@ from worldstate_lab.evaluation.figures import FIGURES, titles
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.degradation_section import (
     degradation_record,
-    stream_table,
     sweep_tables,
 )
 from worldstate_lab.evaluation.report.warning_sections import equal_table
@@ -84,8 +73,7 @@ SMOKE_STATIC, SMOKE_WINDOWS, SMOKE_S = 4, 2, 6.0
 SMOKE_VIDEO_PX, SMOKE_WIDTH_PX = 480, 160
 FULL_SEEDS = 5
 # Options for the place of work and the printed output.
-_NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "against", "seeds")
-COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all")
+_NO_FIGURE = ("run", "needs", "json", "results", "dataset", "out", "jobs", "seeds")
 SHOWN = ("lead_s", "detection", "random_detection", "bearing_deg")
 
 
@@ -98,12 +86,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--model", type=Path, metavar="FILE", help="this library's model (default: the shipped one)")
     add("--static-ids", type=Path, metavar="CSV", help="test recordings of a standing ego")
     add("--dynamic-ids", type=Path, metavar="CSV", help="test recordings of a moving ego")
-    add("--hazard-free", type=Path, nargs="+", default=[], metavar="PATH", help="sound without a vehicle")
-    add("--hazard-free-hours", type=float, metavar="H", help="hazard-free hours to score (default: all)")
-    add("--stage-streams", action="store_true", help="also stage camera failure and rain on these streams")
-    add("--onnx-model", type=Path, metavar="ONNX", help="second detector (default: another without a model)")
-    add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of that model")
-    add("--against", type=Path, metavar="DIR", help="finished evaluation for a comparison")
     add("--seed", type=int, default=1, help="seed of streets, folds, intervals (default: %(default)s)")
     add("--full", action="store_true", help=f"{FULL_SEEDS} draws of folds, sweep over all videos")
     add("--smoke", action="store_true", help="quick check on four recordings, one minute")
@@ -128,18 +110,14 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         track,
         EvaluationSettings(
             seeds,
-            arguments.hazard_free_hours,
             degradation=_degradation(arguments, classifiers, takes),
-            stage_streams=arguments.stage_streams,
         ),
     )
-    save_scores(arguments.out, found.scores)
-    compared = _compared(arguments)
-    report = _report(found, compared)
+    report = _report(found)
     write_report(arguments.out / "evaluation.json", report)
     write_document(evaluation_document(found, _configuration(arguments)), arguments.out)
     shown = {"out": str(arguments.out), "data": takes.origin, "windows": classifiers.told}
-    return CommandResult(report, table=shown, lines=[*_lines(found), *_against_lines(compared)])
+    return CommandResult(report, table=shown, lines=_lines(found))
 
 
 def _degradation(
@@ -156,10 +134,6 @@ def _degradation(
         model = model_from_windows(classifiers.windows, arguments.out / "cache", seed)
     if arguments.smoke:
         return DegradationSettings(detectors[:1], model, width_px=SMOKE_WIDTH_PX, seed=seed)
-    if arguments.onnx_model is not None:
-        model_file, labels = str(arguments.onnx_model), tuple(arguments.labels)
-        second = detector_name(model_file), detector_maker(model_file, labels), DetectionFilter()
-        detectors = detectors[0], StagedDetector(*second)
     settings = DegradationSettings(detectors, model, seed=seed)
     return whole_sweep(takes, settings) if arguments.full else settings
 
@@ -175,8 +149,6 @@ def _is_foreign(take: Take) -> bool:
 
 def _check(arguments: argparse.Namespace) -> None:
 
-    if arguments.stage_streams and not arguments.hazard_free:
-        raise InvalidArgumentError("--stage-streams: expected streams with --hazard-free, got none")
     if arguments.dataset is not None and arguments.smoke:
         raise InvalidArgumentError("--smoke: expected no DATASET, because it simulates four recordings")
 
@@ -193,29 +165,6 @@ def _told(value: object) -> str:
     return "none" if value is None else value.name if isinstance(value, Path) else str(value)
 
 
-def _compared(arguments: argparse.Namespace) -> Sequence[Comparison]:
-
-    if arguments.against is None:
-        return ()
-    return compare(arguments.out, arguments.against, np.random.default_rng(arguments.seed))
-
-
-def _difference(one: Comparison) -> dict[str, object]:
-    """Return JSON-compatible values without figures that neither evaluation has."""
-    known = {name: values for name, values in one.differences.items() if values[0] == values[0]}
-    return {"protocol": one.protocol, "method": one.method, "shared": one.shared, "differences": known}
-
-
-def _against_lines(compared: Sequence[Comparison]) -> list[str]:
-    """Return the differences of the main figures from the other evaluation, with their intervals."""
-    rows: list[tuple[Cell, ...]] = [
-        (one.protocol, one.method, one.shared, *(Value(*one.differences[name]) for name in COMPARED))
-        for one in compared
-    ]
-    table = Table("against", "minus the other evaluation:", ("protocol", "method", "shared", *COMPARED), rows)
-    return ["", *table.lines()] if rows else []
-
-
 def _takes(arguments: argparse.Namespace) -> TakeList:
 
     if arguments.model is not None:
@@ -225,7 +174,6 @@ def _takes(arguments: argparse.Namespace) -> TakeList:
         root,
         static_ids=arguments.static_ids,
         dynamic_ids=arguments.dynamic_ids,
-        hazard_free=arguments.hazard_free,
     )
 
 
@@ -278,7 +226,7 @@ def _classifiers(arguments: argparse.Namespace, takes: TakeList) -> Classifiers:
     return Classifiers(*(found or (None, "the calibration recordings of each fold")))
 
 
-def _report(found: Evaluation, compared: Sequence[Comparison]) -> dict[str, object]:
+def _report(found: Evaluation) -> dict[str, object]:
 
     report: dict[str, object] = plain(
         {
@@ -298,11 +246,9 @@ def _report(found: Evaluation, compared: Sequence[Comparison]) -> dict[str, obje
             },
             "equal_detection": found.equal,
             "degradation": None if found.degradation is None else degradation_record(found.degradation),
-            "staged_streams": found.staged,
             "front_end": None
             if (study := found.front_end) is None
             else {**study.figures, "bearing_srp_by_junction": study.by_site},
-            "against": [_difference(one) for one in compared],
         }
     )
     return report
@@ -313,7 +259,6 @@ def _lines(found: Evaluation) -> list[str]:
     lines = [f"not processed: {one.name}: {one.problem}" for one in found.failed]
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
     tables = [] if found.degradation is None else sweep_tables(found.degradation)
-    tables += [] if found.staged is None else [stream_table(found.staged)]
     for name, run in found.runs.items():
         refused = found.refused.get(name, {})
         lines += ["", *_warnings(found, name).lines(), *run.cautions]

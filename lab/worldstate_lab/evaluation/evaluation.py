@@ -13,22 +13,13 @@ import numpy as np
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import IndexArray
-from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.degradation.degradation_study import (
     DegradationSettings,
     DegradationStudy,
     SweepItem,
     Tables,
     degradation_study,
-)
-from worldstate_lab.degradation.staged_filter import (
-    STREAM_VERSION,
-    StreamSweep,
-    staged_advisories,
-    states_told,
-    stream_sweep,
 )
 from worldstate_lab.evaluation.protocols import methods_for, refused_methods
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
@@ -41,9 +32,8 @@ from worldstate_lab.trials.pass_cache import (
     attempted,
     fingerprint,
     hear,
-    within_hours,
 )
-from worldstate_lab.trials.trial import Take, TakeList, Trial
+from worldstate_lab.trials.trial import TakeList, Trial
 
 from .front_end_study import FrontEndStudy, front_end_study
 from .protocols import PROTOCOLS, ProtocolRun, run_protocol
@@ -68,10 +58,8 @@ class EvaluationSettings:
     """Options of an evaluation."""
 
     seeds: tuple[int, ...] = (1,)  # Seeds of the folds, which are drawn again for each seed
-    hazard_free_hours: float | None = None  # Hazard-free time to score; by default all
     draws: int = DRAWS  # Resamples of the recordings, from which intervals are computed
     degradation: DegradationSettings | None = None  # Sweep over camera degradations; None: no sweep
-    stage_streams: bool = False  # Whether camera degradation and rain are staged on hazard-free streams too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +80,6 @@ class Evaluation:
     refused: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     # By protocol with folds over recordings.
     equal: Mapping[str, Sequence[EqualDetection]] = field(default_factory=dict)
-    staged: StreamSweep | None = None  # Camera degradation and rain on hazard-free streams
 
 
 def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, str]:
@@ -117,8 +104,7 @@ def evaluate(
     """Process all recordings, run every protocol for which they suffice and score every method."""
     lacking_data(takes)
     every = (*takes.static, *takes.dynamic)
-    heard, failed = hear(track(attempted(hearing, every, jobs, attrgetter("name")), "listening", len(every)))
-    trials = within_hours(heard, settings.hazard_free_hours)
+    trials, failed = hear(track(attempted(hearing, every, jobs, attrgetter("name")), "listening", len(every)))
     left = _left(takes, trials)
     # Checked again on the remaining recordings: in a small data set one broken recording may be too many.
     lacking = lacking_data(left, failed)
@@ -153,9 +139,6 @@ def evaluate(
     if settings.degradation is not None:
         with _noted(lacking, "degradation sweep"):
             found = replace(found, degradation=_degradation(left, hearing, jobs, track, settings.degradation))
-    if settings.stage_streams:
-        with _noted(lacking, "staged streams"):
-            found = replace(found, staged=_staged(found, left, hearing, jobs, track))
     return found
 
 
@@ -174,8 +157,8 @@ def _noted(lacking: dict[str, str], name: str) -> Iterator[None]:
 
 
 def _left(takes: TakeList, trials: Sequence[Trial]) -> TakeList:
-    """Return the recordings that were processed and are scored; a stream is kept if any piece of it is."""
-    names = {str(trial.hops.about.get("stream", trial.name)) for trial in trials}
+    """Return the recordings that were processed and are scored."""
+    names = {trial.name for trial in trials}
     kept = [tuple(one for one in some if one.name in names) for some in (takes.static, takes.dynamic)]
     return replace(takes, static=kept[0], dynamic=kept[1])
 
@@ -203,38 +186,3 @@ def _degradation(
     recordings = [Recording.open(take.path) for take in filmed]
     keep = PassCache(hearing.folder).tables
     return degradation_study(recordings, settings, over=over, keep=keep, fingerprint=named)
-
-
-@dataclass(frozen=True, slots=True)
-class _StagedStream:
-    """Processes one stream in any worker process."""
-
-    hearing: Hearer
-    seed: int
-
-    def __call__(self, take: Take) -> HopTable:
-        """Return the advisories in every camera state, from the cache if an earlier run stored them."""
-        folder, model = self.hearing.folder, self.hearing.model
-        mark = fingerprint(take.path, folder / "fingerprints")
-        key = [STREAM_VERSION, mark, states_told(), encode(read_model(model)), self.seed]
-
-        def make() -> dict[str, HopTable]:
-            return {"advised": staged_advisories(take.path, model, self.seed)}
-
-        return PassCache(folder).tables("staged-streams", key, make)["advised"]
-
-
-def _staged(found: Evaluation, takes: TakeList, hearing: Hearer, jobs: int, track: Progress) -> StreamSweep:
-    """Stage every state of the camera and every level of rain on the hazard-free streams."""
-    names = {str(t.hops.about["stream"]) for t in found.trials if "stream" in t.hops.about}
-    streams = [take for take in takes.static if take.name in names]
-    if not streams:
-        raise InvalidArgumentError("needs a stream of two minutes or more without hazards, found none")
-    seed = found.settings.seeds[0]
-    work = attempted(_StagedStream(hearing, seed), streams, jobs, attrgetter("name"))
-    done = []
-    for one in track(work, "staging camera and rain on streams", len(streams)):
-        if isinstance(one, Failed):
-            raise InvalidArgumentError(f"{one.name}: {one.problem}")
-        done.append(one)
-    return stream_sweep(done, seed)

@@ -50,7 +50,8 @@ class Protocol:
         self, trials: Sequence[Trial], rng: np.random.Generator
     ) -> Iterator[tuple[list[int], list[int]]]:
         """Yield rows of calibration and test recordings; every recording is a test recording once."""
-        fold_of = self._by_junction(trials) if self.by_junction else _dealt(trials, rng)
+        labels, sites = [trial.label for trial in trials], [trial.site for trial in trials]
+        fold_of = self._by_junction(trials) if self.by_junction else deal_folds(labels, sites, rng, FOLDS)
         for fold in np.unique(fold_of[fold_of >= 0]).tolist():
             calibration = np.flatnonzero(fold_of != fold).tolist()
             tested = np.flatnonzero(fold_of == fold).tolist()
@@ -60,7 +61,7 @@ class Protocol:
             yield calibration, tested
 
     def _by_junction(self, trials: Sequence[Trial]) -> np.ndarray:
-        """Return the number of each trial's junction; streams have none and are used only for calibration."""
+        """Return the number of each trial's junction; -1 if one kind of recordings is missing there."""
         names = junctions_with_both([(trial.site, trial.hazard_free) for trial in trials])
         return np.array([names.index(j) if (j := junction_of(t.site)) in names else -1 for t in trials])
 
@@ -84,28 +85,6 @@ def junctions_with_both(sites: Sequence[tuple[str, bool]]) -> list[str]:
     for site, hazard_free in sites:
         kinds.setdefault(junction_of(site), set()).add(hazard_free)
     return sorted(name for name, found in kinds.items() if len(found) == 2)
-
-
-def _dealt(trials: Sequence[Trial], rng: np.random.Generator) -> np.ndarray:
-    """Assign recordings to folds; consecutive pieces of a stream stay together."""
-    whole = [i for i, trial in enumerate(trials) if "stream" not in trial.hops.about]
-    fold_of = np.full(len(trials), -1)
-    if whole:
-        labels, sites = [trials[i].label for i in whole], [trials[i].site for i in whole]
-        streamed = len(whole) < len(trials)
-        free = sum(label == "none" for label in labels)
-        if free >= 2 or not streamed:
-            fold_of[whole] = deal_folds(labels, sites, rng, FOLDS)
-        else:
-            # All hazard-free time is in streams: only the approaches are assigned.
-            fold_of[whole] = rng.permutation(np.arange(len(whole)) % FOLDS)
-    pieces: dict[str, list[int]] = {}
-    for i, trial in enumerate(trials):
-        if "stream" in trial.hops.about:
-            pieces.setdefault(str(trial.hops.about["stream"]), []).append(i)
-    for rows in pieces.values():
-        fold_of[rows] = np.arange(len(rows)) * FOLDS // len(rows)
-    return fold_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, SLACK_S, onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable
-from worldstate_lab.metrics.track_measures import TrackRows, TruthRows, gospa_bearing, track_measures
+from worldstate_lab.metrics.track_measures import gospa_bearing
 from worldstate_lab.trials.trial import LEFT, NO_SIDE, RIGHT, Decisions, Trial
 
 # The paper's horizons before line-of-sight entry.
@@ -132,32 +132,11 @@ def visible_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     }
 
 
-def track_counts(trial: Trial, said: Decisions) -> dict[str, float]:
-    """Score the tracks of one recording against the vehicles in view."""
-    measured = track_measures(_track_rows(said), _truth_rows(trial, said), HOP_S)
-    if not measured.active_s:
-        return {}
-    matched = np.isfinite(measured.azimuth_error_rad)
-    return {
-        "tracked": 1.0,
-        "id_switches": float(measured.identity_switches),
-        "fragmentations": float(measured.fragmentations),
-        "swap_rate_hz": measured.swap_rate_hz,
-        "fragmentation_rate_hz": measured.fragmentation_rate_hz,
-        "track_latency_s": measured.latency_s,
-        "matched": float(matched),
-        "azimuth_error_rad": measured.azimuth_error_rad if matched else 0.0,
-    }
-
-
 def gospa_counts(trial: Trial, said: Decisions, by_tracks: bool) -> dict[str, float]:
     """Sum the GOSPA over the hops with a vehicle in view: of the tracks, or of the bearing during alarms."""
-    truth, tracks = _truth_rows(trial, said), _track_rows(said)
     stated = said.alarm & np.isfinite(said.bearing_rad)
-    rows = (
-        (tracks.hop, tracks.azimuth_rad) if by_tracks else (np.flatnonzero(stated), said.bearing_rad[stated])
-    )
-    estimates, there = _by_hop(*rows), _by_hop(truth.hop[truth.active], truth.azimuth_rad[truth.active])
+    rows = _track_rows(said) if by_tracks else (np.flatnonzero(stated), said.bearing_rad[stated])
+    estimates, there = _by_hop(*rows), _by_hop(*_truth_rows(trial, said))
     costs = [_gospa(estimates.get(hop, ()), vehicles) for hop, vehicles in there.items()]
     return {"gospa_rad": sum(costs), "gospa_hops": float(len(costs))}
 
@@ -175,19 +154,20 @@ def _by_hop(hop: IndexArray, azimuth_rad: FloatArray) -> dict[int, tuple[float, 
     return angles
 
 
-def _track_rows(said: Decisions) -> TrackRows:
+def _track_rows(said: Decisions) -> tuple[IndexArray, FloatArray]:
+    """Return hop and azimuth of every track, shape (n,) each."""
     hop = hop_of(said.tracks.time_s, said.time_s)
-    use = np.flatnonzero(hop >= 0)
-    return TrackRows(hop[use], said.tracks.track[use].astype(np.int64), said.tracks.azimuth_rad[use])
+    return hop[hop >= 0], said.tracks.azimuth_rad[hop >= 0]
 
 
-def _truth_rows(trial: Trial, said: Decisions) -> TruthRows:
+def _truth_rows(trial: Trial, said: Decisions) -> tuple[IndexArray, FloatArray]:
+    """Return hop and azimuth of every vehicle in view, shape (n,) each."""
     hop = hop_of(trial.truth.time_s, said.time_s)
     # A camera faster than the hop rate shows a vehicle several times per hop.
     _, first = np.unique(np.stack([hop, trial.truth.vehicle]), axis=1, return_index=True)
     use = np.sort(first[hop[first] >= 0])
-    vehicle, in_view = trial.truth.vehicle[use].astype(np.int64), trial.truth.in_view[use].astype(bool)
-    return TruthRows(hop[use], vehicle, trial.truth.azimuth_rad[use], in_view)
+    use = use[trial.truth.in_view[use].astype(bool)]
+    return hop[use], trial.truth.azimuth_rad[use]
 
 
 def check_decisions(trial: Trial, said: Decisions) -> None:

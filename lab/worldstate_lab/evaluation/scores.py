@@ -56,12 +56,11 @@ class Scored:
     name: str
     label: str
     site: str
-    fingerprint: str = ""  # Hash of the recording's content
 
     @classmethod
     def of(cls, trial: Trial) -> "Scored":
         """Return the row of a trial."""
-        return cls(trial.name, trial.label, trial.site, str(trial.hops.about.get("fingerprint", "")))
+        return cls(trial.name, trial.label, trial.site)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,16 +251,8 @@ def paired(ours: Score, other: Score, draws: IndexArray) -> dict[str, tuple[floa
     """Return our value minus the other for every figure, with the central 95 % on the same draws."""
     if ours.recordings != other.recordings:
         raise InvalidArgumentError("scores: expected two methods on the same recordings in the same order")
-    rows = np.arange(len(ours.recordings))
-    return paired_on(ours, other, rows, rows, draws)
-
-
-def paired_on(
-    ours: Score, other: Score, ours_rows: IndexArray, other_rows: IndexArray, draws: IndexArray
-) -> dict[str, tuple[float, float, float]]:
-    """Compare two scores on the recordings in these rows of each; draws (D, n) index the rows."""
-    every = np.vstack([np.arange(len(ours_rows)), draws])
-    a, b = ours.draws(ours_rows[every]), other.draws(other_rows[every])
+    every = np.vstack([np.arange(len(ours.recordings)), draws])
+    a, b = ours.draws(every), other.draws(every)
     # Both methods fail on the same hard recordings. These errors cancel only if both use the same draws.
     gains = {name: a[name] - b[name] for name in a}
     return {name: (float(gain[0]), *middle(gain[1:])) for name, gain in gains.items()}
@@ -276,7 +267,6 @@ def _counts(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[dict[str
         row = dict.fromkeys(COUNTS, 0.0) | reduction.alarm_counts(trial, one)
         row |= reduction.awareness_counts(trial, one) | reduction.window_counts(trial, one)
         row |= reduction.visible_counts(trial, one)
-        row |= reduction.track_counts(trial, one) if tracks else {}
         row |= reduction.gospa_counts(trial, one, tracks) if tracks or bearings else {}
         rows.append(row | {"sided": row["detected"] * sides})
     return rows

@@ -1,8 +1,4 @@
-"""Measures of tracks in bearing: those of the LOCATA challenge and of CLEAR-MOT, and GOSPA.
-
-C. Evers et al., "The LOCATA challenge: acoustic source localization and tracking", IEEE/ACM TASLP 28, 2020;
-K. Bernardin and R. Stiefelhagen, "Evaluating multiple object tracking performance: the CLEAR MOT metrics",
-EURASIP Journal on Image and Video Processing, 2008.
+"""GOSPA of tracks in bearing, and prominence gating.
 
 Prominence gating gives the accuracy of bearings with a camera reference as a function of the share kept.
 """
@@ -14,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.adapters.camera.box_linking import gated_pairs
-from worldstate.ground.checks import check_shape, finite_array, in_range
+from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray, IntArray
+from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.ground.values import NotUsable, wrap_angle
 from worldstate.operations.recordings.hop_table import HopTable
 
@@ -149,8 +145,7 @@ def gated_median_deg(checks: HopTable) -> float:
 
 
 # A miss costs half of it. At 20 degrees, a common choice for bearing trackers, no output (10) scores better
-# than any estimate with an error of 10 degrees or more. At 60, a miss costs as much as the gate of the track
-# measures.
+# than any estimate with an error of 10 degrees or more.
 CUTOFF_RAD = math.radians(60.0)
 
 
@@ -200,211 +195,6 @@ def gospa_bearing(
         cut / 2.0 * (estimates.size - len(pairs)),
     )
     return Gospa(sum(parts) ** (1.0 / power), *parts, pairs)
-
-
-# The gate of the LOCATA challenge.
-GATE_RAD = math.radians(30.0)
-# Angles are at most pi: a match within the gate always costs less than a miss, and a match kept from the
-# previous hop (CLEAR-MOT) less than both.
-_MISS, _HOLD = 1e3, 1e6
-# Two tracks on the same side of two sources cost the same in both assignments, and round-off would swap their
-# identities at random: a small part of the squared error decides by the order of the sources.
-_TIE = 1e-6
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackRows:
-    """Estimates, one row per hop and track.
-
-    Examples
-    --------
-    >>> TrackRows(np.array([0, 1]), np.array([7, 7]), np.array([0.1, 0.2])).track
-    array([7, 7])
-    """
-
-    hop: IntArray  # shape (n,): Number of the hop
-    track: IntArray  # shape (n,): Identity
-    azimuth_rad: FloatArray  # shape (n,)
-
-    def __post_init__(self) -> None:
-        finite_array("azimuth_rad", self.azimuth_rad, (len(self.hop),))
-        check_shape("track", self.track.shape, self.hop.shape)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TruthRows:
-    """Sources, one row per hop and source.
-
-    Examples
-    --------
-    >>> TruthRows(np.array([0]), np.array([1]), np.array([0.1]), np.array([True])).active
-    array([ True])
-    """
-
-    hop: IntArray  # shape (n,): Number of the hop
-    source: IntArray  # shape (n,): Identity
-    azimuth_rad: FloatArray  # shape (n,)
-    active: BoolArray  # shape (n,): Whether a track is expected
-
-    def __post_init__(self) -> None:
-        finite_array("azimuth_rad", self.azimuth_rad, (len(self.hop),))
-        check_shape("source", self.source.shape, self.hop.shape)
-        check_shape("active", self.active.shape, self.hop.shape)
-
-
-@dataclass(frozen=True, slots=True)
-class TrackMeasures:
-    """Means over active periods (runs of hops in which one source is active); NaN without an active source.
-
-    Examples
-    --------
-    >>> hops = np.arange(10)
-    >>> truth = TruthRows(hops, np.ones(10, int), np.zeros(10), np.ones(10, bool))
-    >>> late = TrackRows(hops[3:], np.full(7, 4), np.full(7, 0.1))
-    >>> said = track_measures(late, truth, hop_s=0.1)
-    >>> round(said.latency_s, 3), said.detection, said.swap_rate_hz, round(said.azimuth_error_rad, 3)
-    (0.3, 0.7, 0.0, 0.1)
-    """
-
-    latency_s: float  # Time from the start of a period to its first track; the whole period if there is none
-    swap_rate_hz: float  # Changes of the track of a source, per second
-    fragmentation_rate_hz: float  # Swaps and returns of a lost track, per second
-    azimuth_error_rad: float  # Mean absolute error within the gate
-    detection: float  # Share of the hops of a period with a track
-    identity_switches: int  # Identity switches of CLEAR-MOT, which keeps a match while it is within the gate
-    fragmentations: int
-    active_s: float  # Total length of all periods
-
-
-_NOTHING_ACTIVE = TrackMeasures(math.nan, math.nan, math.nan, math.nan, math.nan, 0, 0, 0.0)
-
-
-def track_measures(
-    estimates: TrackRows, truths: TruthRows, hop_s: float, gate_rad: float = GATE_RAD
-) -> TrackMeasures:
-    """Compare tracks with sources, matched hop by hop within a gate.
-
-    Examples
-    --------
-    A track that is lost for one hop and comes back under another name:
-
-    >>> hops = np.arange(10)
-    >>> truth = TruthRows(hops, np.ones(10, int), np.zeros(10), np.ones(10, bool))
-    >>> there = hops != 5
-    >>> said = track_measures(TrackRows(hops[there], (hops > 5)[there] * 1, np.zeros(9)), truth, 0.1)
-    >>> said.swap_rate_hz, said.fragmentation_rate_hz, said.identity_switches, said.fragmentations
-    (1.0, 2.0, 1, 1)
-    """
-    period_s = in_range("hop_s", hop_s, 0.0, math.inf, open_low=True)
-    gate = in_range("gate_rad", gate_rad, 0.0, math.pi)
-    free, kept = (_match(estimates, truths, gate, keep=keep) for keep in (False, True))
-    if not free.source.size:
-        return _NOTHING_ACTIVE
-    swaps, returns = free.swaps(), free.returns(free.period)
-    return TrackMeasures(
-        latency_s=float(free.latency_hops().mean()) * period_s,
-        swap_rate_hz=free.rate(swaps) / period_s,
-        fragmentation_rate_hz=free.rate(swaps, returns) / period_s,
-        azimuth_error_rad=free.azimuth_error_rad(),
-        detection=free.rate(np.flatnonzero(free.matched)),
-        identity_switches=kept.swaps().size,
-        fragmentations=kept.returns(kept.source).size,
-        active_s=free.matched.size * period_s,
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Matched:
-    """The active rows by source and hop, each with its matched track."""
-
-    source: IntArray
-    period: IndexArray  # Number of the active period
-    place: IndexArray  # Position within the period, in hops
-    matched: BoolArray
-    track: IntArray  # Number of the matched track, if any
-    error_rad: FloatArray
-
-    def swaps(self) -> IndexArray:
-        """Return the rows at which a source has another track than at its last match."""
-        # As in the challenge and in CLEAR-MOT, a new identity after misses or pauses counts as a swap.
-        rows = np.flatnonzero(self.matched)
-        changed: BoolArray = (np.diff(self.source[rows]) == 0) & (np.diff(self.track[rows]) != 0)
-        return rows[1:][changed]
-
-    def returns(self, stretch: IntArray | IndexArray) -> IndexArray:
-        """Return the rows at which a source is matched again after misses in the same run of rows."""
-        # The released code of the challenge also counts the first match after a late start. The article
-        # defines only interrupted tracks, and a late start is already part of the latency.
-        rows = np.flatnonzero(self.matched)
-        resumed: BoolArray = (np.diff(rows) > 1) & (np.diff(stretch[rows]) == 0)
-        return rows[1:][resumed]
-
-    def latency_hops(self) -> IndexArray:
-        """Return the hops of each period before its first match, or all of them if there is none."""
-        # If left out, or set to 0 as in the released code, a source that is never found would lower the
-        # latency.
-        first = np.bincount(self.period)
-        np.minimum.at(first, self.period[self.matched], self.place[self.matched])
-        return first
-
-    def azimuth_error_rad(self) -> float:
-        """Return the mean over periods of the mean error; periods without a match are left out."""
-        counts = np.bincount(self.period[self.matched])
-        sums = np.bincount(self.period[self.matched], self.error_rad[self.matched])
-        return float(np.mean(sums[counts > 0] / counts[counts > 0])) if counts.size else math.nan
-
-    def rate(self, *events: IndexArray) -> float:
-        """Return the number of events per hop, mean over periods."""
-        hops = np.bincount(self.period)
-        happened = np.bincount(self.period[np.concatenate(events)], minlength=hops.size)
-        return float(np.mean(happened / hops))
-
-
-def _match(estimates: TrackRows, truths: TruthRows, gate: float, *, keep: bool) -> _Matched:
-    track, error = _match_hops(estimates, truths, gate, keep)
-    order = np.lexsort((truths.hop, truths.source))
-    order = order[truths.active[order]]
-    hop, source = truths.hop[order], truths.source[order]
-    begins = (np.diff(source, prepend=source[:1] - 1) != 0) | (np.diff(hop, prepend=0) != 1)
-    period = np.cumsum(begins) - 1
-    return _Matched(
-        source=source,
-        period=period,
-        place=np.arange(hop.size) - np.flatnonzero(begins)[period],
-        matched=np.isfinite(error[order]),
-        track=track[order],
-        error_rad=error[order],
-    )
-
-
-def _match_hops(
-    estimates: TrackRows, truths: TruthRows, gate: float, keep: bool
-) -> tuple[IntArray, FloatArray]:
-    """Return track and error of every truth, NaN if it has none."""
-    track, error = np.zeros(truths.hop.size, np.int64), np.full(truths.hop.size, np.nan)
-    there = _rows_by_hop(np.arange(estimates.hop.size), estimates.hop)
-    active = _rows_by_hop(np.flatnonzero(truths.active), truths.hop)
-    last: set[tuple[int, int, int]] = set()
-    for hop in sorted(active.keys() & there.keys()):
-        rows, said = active[hop], there[hop]
-        sources, names = truths.source[rows].tolist(), estimates.track[said].tolist()
-        # Matches of the previous hop are kept, as in CLEAR-MOT; after a miss the nearest track is taken.
-        held = np.array([[(hop - 1, source, name) in last for name in names] for source in sources])
-        cost = _bearing_errors(truths.azimuth_rad[rows], estimates.azimuth_rad[said])
-        within = cost <= gate
-        price = cost + _TIE * cost**2 - _HOLD * (keep & held & within)
-        pairs = gated_pairs(price, within, _MISS)
-        ours, theirs = rows[pairs[:, 0]], said[pairs[:, 1]]
-        track[ours], error[ours] = estimates.track[theirs], cost[pairs[:, 0], pairs[:, 1]]
-        last = {(hop, sources[i], names[j]) for i, j in pairs.tolist()}
-    return track, error
-
-
-def _rows_by_hop(rows: IndexArray, hop: IntArray) -> dict[int, IndexArray]:
-    rows = rows[np.argsort(hop[rows], kind="stable")]
-    values, starts = np.unique(hop[rows], return_index=True)
-    # The piece before the first start is empty, and the only one if there are no rows.
-    return dict(zip(values.tolist(), np.split(rows, starts)[1:], strict=True))
 
 
 def _bearing_errors(truths_rad: FloatArray, estimates_rad: FloatArray) -> FloatArray:

@@ -6,23 +6,21 @@ The work is distributed over processes of this machine; results do not depend on
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
-
-import numpy as np
 
 from worldstate.adapters.camera.video import VIDEO_NAME
 from worldstate.adapters.datasets.ovad import AUDIO_NAME, DETECTION_NAMES, TRUTH_NAME, named_array
 from worldstate.adapters.files.file_io import write_text
 from worldstate.adapters.files.model_file import read_model
 from worldstate.frontend.array.steering import one_blas_thread
-from worldstate.ground.errors import InputFileError, InvalidArgumentError, WorldstateError
+from worldstate.ground.errors import InputFileError, WorldstateError
 from worldstate.ground.parallel import in_processes
 from worldstate.ground.serialisation import encode
-from worldstate.operations.recordings.hop_table import HOP_S, HopTable, load_named, save_named
+from worldstate.operations.recordings.hop_table import HopTable, load_named, save_named
 
 from .listening import (
     VERSION,
@@ -32,7 +30,7 @@ from .listening import (
     model_refusal,
     unfiltered_decisions,
 )
-from .trial import DECISION_COLUMNS, Decisions, Take, Trial
+from .trial import Take, Trial
 
 
 def origin_of(made_of: object) -> str:
@@ -199,9 +197,6 @@ def _attempt(work: Callable[[Item], Result], named: tuple[str, Item]) -> Result 
 
 
 ALPHA = 0.02
-# Streams are cut into pieces of this length, which are assigned to folds in order. A threshold is then set on
-# other minutes of the same stream. An alarm that continues across a cut counts twice.
-PIECE_S = 60.0
 # Results that need a model for this sound: decisions of whole chains, and scores by hop.
 CHAIN_NAMES = ("shipped", "adapted", "filtered")
 SCORES = ("shipped", "grounded", "rateless")
@@ -254,77 +249,15 @@ class Hearer:
 
 
 def hear(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
-    """Return the trials in the order of the recordings, cut into pieces, and the failed recordings."""
+    """Return the trials in the order of the recordings, and the failed recordings."""
     trials: list[Trial] = []
     failed: list[Failed] = []
     for found in heard:
         if isinstance(found, Failed):
             failed.append(found)
         else:
-            trials += _pieces(found)
+            trials.append(found)
     return trials, failed
-
-
-def within_hours(trials: Sequence[Trial], hours: float | None) -> list[Trial]:
-    """Keep all approaches, and hazard-free recordings in order until their total reaches these hours."""
-    if hours is None:
-        return list(trials)
-    kept, left_s = [], hours * 3600.0
-    for trial in trials:
-        if trial.hazard_free and left_s <= 1e-9:
-            continue
-        kept.append(trial)
-        left_s -= scored_s(trial) if trial.hazard_free else 0.0
-    if left_s > 1e-9:
-        have = hours - left_s / 3600.0
-        raise InvalidArgumentError(
-            f"--hazard-free-hours: expected at most the available {have:.4g} h, got {hours:g}; "
-            "add more with --hazard-free"
-        )
-    return kept
-
-
-def scored_s(trial: Trial) -> float:
-    """Return the scored time: one hop per decision."""
-    return len(trial.hops) * HOP_S
-
-
-def _pieces(trial: Trial) -> Iterator[Trial]:
-    """Cut a long hazard-free recording into pieces."""
-    time_s = trial.hops.time_s
-    count = int(scored_s(trial) / PIECE_S)
-    if not trial.hazard_free or count < 2:
-        yield trial
-        return
-    edges_s = time_s[0] + PIECE_S * np.arange(count)
-    for i, first_s in enumerate(edges_s.tolist()):
-        last_s = edges_s[i + 1] if i + 1 < count else np.inf
-
-        def inside(moments: np.ndarray, first_s: float = first_s, last_s: float = last_s) -> np.ndarray:
-            return (moments >= first_s - 1e-6) & (moments < last_s - 1e-6)
-
-        yield Trial(
-            _rows(trial.hops, inside).replace(
-                name=f"{trial.name}#{i:03d}", about={**trial.hops.about, "stream": trial.name}
-            ),
-            _rows(trial.boxes, inside),
-            _rows(trial.truth, inside),
-            {name: _cut(said, inside) for name, said in trial.chains.items()},
-        )
-
-
-Inside = Callable[[np.ndarray], np.ndarray]
-
-
-def _rows(table: HopTable, inside: Inside) -> HopTable:
-    kept = inside(table.time_s)
-    return replace(table, columns={name: column[kept] for name, column in table.columns.items()})
-
-
-def _cut(said: Decisions, inside: Inside) -> Decisions:
-    kept = inside(said.time_s)
-    columns: Mapping[str, np.ndarray] = {name: getattr(said, name)[kept] for name in DECISION_COLUMNS}
-    return Decisions(**columns, tracks=_rows(said.tracks, inside))
 
 
 def data_fingerprint(trials: Sequence[Trial]) -> str:

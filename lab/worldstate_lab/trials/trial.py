@@ -23,7 +23,6 @@ from worldstate.adapters.datasets.ovad import (
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.simulation.stream.truth import stream_hazards
 
 LEFT, RIGHT, NO_SIDE = 1, -1, 0
 # Columns of the tables of a trial and of decisions.
@@ -193,13 +192,13 @@ class Take:
 
     Examples
     --------
-    >>> Take(Path("quiet.wav"), "quiet", "stream").hazard_free
+    >>> Take(Path("SA1/none/1_00_0002"), "1_00_0002", "SA1").hazard_free
     True
     """
 
-    path: Path  # Recording folder in OVAD's layout, or a sound file
+    path: Path  # Recording folder in OVAD's layout
     name: str  # Unique in an evaluation
-    site: str  # Such as "SA1"; for a stream its file name
+    site: str  # Such as "SA1"
     label: str = "none"  # Side from which a vehicle comes
     t0_s: float | None = None  # Line-of-sight entry, seconds
     moving: bool = False  # Whether the ego moves
@@ -228,7 +227,7 @@ class TakeList:
     """The recordings of an evaluation."""
 
     root: Path
-    static: tuple[Take, ...]  # Test recordings of a standing ego, streams included
+    static: tuple[Take, ...]  # Test recordings of a standing ego
     dynamic: tuple[Take, ...]  # Test recordings of a moving ego
     training: tuple[Take, ...]  # Other recordings of the data set, which are not tested
     official: bool  # Whether the test recordings are those of the official lists
@@ -251,13 +250,11 @@ def find_takes(
     *,
     static_ids: Path | None = None,
     dynamic_ids: Path | None = None,
-    hazard_free: Sequence[Path] = (),
 ) -> TakeList:
     """Find the recordings of a data set in OVAD's layout; raise an error if any data are missing.
 
     Test recordings are those in the given lists, otherwise those in the official lists if the folder contains
-    them, otherwise all. `hazard_free` adds recordings, data sets or sound files of any length without a
-    vehicle.
+    them, otherwise all.
     """
     if not (root / LOG_NAME).is_file():
         raise InputFileError(root, f"expected a data set in OVAD's layout, with {LOG_NAME}; {_found(root)}")
@@ -280,9 +277,8 @@ def find_takes(
         more = f"\n  and {len(problems) - NAMED} more" if len(problems) > NAMED else ""
         shown = "".join(f"\n  {problem}" for problem in problems[:NAMED])
         raise InputFileError(root, f"{len(problems)} required items are missing:{shown}{more}")
-    streams = [take for path in hazard_free for take in _hazard_free(path)]
     takes = {moving: tuple(map(Take.of, found)) for moving, found in tested.items()}
-    return TakeList(root, (*takes[False], *streams), takes[True], tuple(map(Take.of, others)), official)
+    return TakeList(root, takes[False], takes[True], tuple(map(Take.of, others)), official)
 
 
 def _list(root: Path, name: str) -> Path | None:
@@ -312,28 +308,3 @@ def _missing(recordings: Iterable[Recording]) -> list[str]:
         if recording.label != "none" and recording.t0_s is None:
             problems.append(f"{where}: no T0 in {LOG_NAME}")
     return problems
-
-
-def _hazard_free(path: Path) -> list[Take]:
-    if path.is_dir() and (path / LOG_NAME).is_file():
-        return [Take.of(one) for one in OvadDataset(path).recordings if one.label == "none"]
-    if path.is_dir():
-        one = Recording.open(path)
-        if one.label is None:
-            return [_hazard_free_stream(path)]
-        if one.label != "none":
-            raise InputFileError(path, f"expected a hazard-free recording, got one labelled {one.label}")
-        return [Take.of(one)]
-    if not path.is_file():
-        raise InputFileError(path, "expected a sound file, a recording or a data set without a vehicle")
-    return [Take(path, path.stem, path.stem)]
-
-
-def _hazard_free_stream(path: Path) -> Take:
-    """Return a stream without a label; for a simulated one its truth file is read."""
-    hazards = stream_hazards(path)
-    if hazards:
-        raise InputFileError(
-            path, f"expected a hazard-free stream, got {hazards} vehicles that come out of a hidden arm"
-        )
-    return Take(path, path.name, path.name)

@@ -253,9 +253,7 @@ def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, st
         front_end_section(measured),
         approach_rate_section(measured),
         transfer_section(measured),
-        degradation_section(
-            found.degradation, found.lacking.get("degradation sweep", "not requested"), found.staged
-        ),
+        degradation_section(found.degradation, found.lacking.get("degradation sweep", "not requested")),
         *(section(measured) for section in (ablation_section, tracking_section, strata_section) if static),
         difference_section(found),
         paper_section(measured),
@@ -325,6 +323,5 @@ def _facts(found: Evaluation) -> tuple[tuple[str, str], ...]:
         ("data", found.takes.origin),
         ("fingerprint of the data", data_fingerprint(found.trials) if found.trials else "none"),
         ("seeds of the folds", ", ".join(map(str, settings.seeds))),
-        ("requested hazard-free hours", str(settings.hazard_free_hours or "all")),
         ("draws of recordings for intervals", str(settings.draws)),
     )

@@ -9,7 +9,6 @@ from worldstate_lab.degradation.awareness import AwarenessRow
 from worldstate_lab.degradation.beta_curves import Band
 from worldstate_lab.degradation.conditions import FAMILIES, OFF
 from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
-from worldstate_lab.degradation.staged_filter import StreamSweep
 from worldstate_lab.evaluation.figures import COMMANDS, paper_value
 from worldstate_lab.report.table import Cell, Figure, Section, Table, Value, plain
 
@@ -59,14 +58,12 @@ def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
     return tuple(figures)
 
 
-def degradation_section(
-    study: DegradationStudy | None, lacking: str, staged: StreamSweep | None = None
-) -> Section:
+def degradation_section(study: DegradationStudy | None, lacking: str) -> Section:
     """Return miss rates and awareness of every detector, or what is missing and how to obtain it."""
-    title, streams = "Vision degradation", () if staged is None else (stream_table(staged),)
+    title = "Vision degradation"
     if study is None:
         told = f"Not run: {lacking}. On recordings with video, {COMMANDS['ovad']} computes it."
-        return Section(title, (told,), streams)
+        return Section(title, (told,))
     names = " and ".join(sweep.detector for sweep in study.sweeps)
     model = study.settings.model
     heard = "the shipped model" if model is None else f"the model {model.name}"
@@ -83,24 +80,7 @@ def degradation_section(
             f"{study.largest_awareness_difference:.3f}, and beta by {study.beta_shift:+.3f} on average."
         )
     parts = tuple(_detector_section(sweep, number) for number, sweep in enumerate(study.sweeps, start=1))
-    return Section(title, tuple(text), streams, parts)
-
-
-def stream_table(sweep: StreamSweep) -> Table:
-    """Return the advisories per hour in every staged state of camera and rain."""
-    rows: list[tuple[Cell, ...]] = []
-    for row in sweep.rows:
-        rates = Value(*row.per_hour, digits=1), Value(row.upper_90, digits=1)
-        rows.append((row.name, row.onsets, *rates, Value(*row.ratio)))
-    return Table(
-        "staged_streams",
-        "Advisories without hazards, with a degraded camera and rain",
-        ("state", "onsets", "an hour", "at most (90 %)", "to the clean camera"),
-        rows,
-        f"On {sweep.hours:.2f} h of streams without hazards. Boxes of the camera are removed at the rates in "
-        "the table of miss rates, and the camera reports its degradation. The ratios resample minutes, the "
-        "same for both states.",
-    )
+    return Section(title, tuple(text), subsections=parts)
 
 
 def sweep_tables(study: DegradationStudy) -> list[Table]:

@@ -24,11 +24,7 @@ _WARNING = (
 )
 _AREAS = ("auroc_all", "auroc_2s", "auroc_1s")
 _CALIBRATION = (*_AREAS, "ece", "ece_floor", "ece_raw", "brier_skill", "hazard_share")
-_TRACKING = (
-    *("id_switches_per_recording", "fragmentations_per_recording", "swap_rate_hz", "fragmentation_rate_hz"),
-    *("track_latency_s", "azimuth_error_deg", "gospa_deg"),
-    *("visible_error_s", "visible_error_constant_s", "visible_coverage"),
-)
+_TRACKING = ("gospa_deg", "visible_error_s", "visible_error_constant_s", "visible_coverage")
 # By condition of the paper's section VIII: clear is after T0 with the vehicle in view, occluded is before T0.
 _STRATA = ("hazard_awareness", "bearing_deg", "detection", "random_detection", *_AREAS)
 _BUDGET = ("false_alarms_per_hour", "detection", "random_detection", "lead_s")
@@ -190,7 +186,7 @@ def _points(measured: MeasuredValues) -> list[OperatingPoint]:
 
 
 def tracking_section(measured: MeasuredValues) -> Section:
-    """Return identities, LOCATA's measures, GOSPA and time to visible of the methods that have any."""
+    """Return GOSPA and time to visible of the methods that have any."""
     table = measured.table(
         STANDING,
         measured.methods(STANDING, _TRACKING),
