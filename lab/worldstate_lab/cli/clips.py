@@ -11,13 +11,9 @@ probability of each class of road users, and the largest change of any of these 
 rises or falls by 6 dB over the band. For clips with a road_user it has the log-loss and that of the shares of
 the table, to which the probabilities are corrected. Every recording has the same weight.
 
---simulated N simulates N clips of each kind and compares their features with the real ones, and real with
-real (halves of the recordings): the median over the features of |AUROC - 0.5|, and the area of a boosted
-classifier.
-
 Examples
 --------
-  worldstate-lab clips clips.csv --numbers numbers.npz --simulated 20
+  worldstate-lab clips clips.csv --numbers numbers.npz
 """
 
 import argparse
@@ -33,25 +29,15 @@ from worldstate.adapters.files.file_io import load_npz, read_rows
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
-from worldstate.commissioning.guard_training import IDLING, rows_of_clip
 from worldstate.commissioning.recorded_clips import heard_clip
 from worldstate.commissioning.road_user_training import tilted
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray, TextArray
-from worldstate.operations.metrics.approach_table import auroc
-from worldstate_lab.streets.set_classifiers import boosted_area
 
 MOST_BYTES = 1 << 30
 NUMBERS = len(MEASURES) + len(BANDS)
-SAID, FOLDS, TILT_DB = 0.9, 4, 6.0
-# Kinds of the simulator with which a kind of clip is compared.
-SIMULATED = {
-    **{"car": ("light",), "tram": ("tram",), "engine_idling": tuple(f"idling {kind}" for kind in IDLING)},
-    **{"siren": ("siren", "wail", "sweeps", "turns"), "car_horn": ("horn", "horns"), "dog_bark": ("dog",)},
-    **{"children_playing": ("children",), "street_music": ("music", "tune", "drums"), "gun_shot": ("shots",)},
-}
+SAID, TILT_DB = 0.9, 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,47 +143,6 @@ def _calibration(clips: ClipNumbers, model: RoadUserModel) -> dict[str, Any]:
     }
 
 
-def realism_rows(
-    clips: ClipNumbers, each: int, rng: np.random.Generator, advance: Callable[[], object] = lambda: None
-) -> dict[str, dict[str, float]]:
-    """Return by kind the distance of simulated features from real ones, and of real from real."""
-    found = {}
-    for kind, names in SIMULATED.items():
-        hops = (clips.kinds == kind)[clips.clip]
-        recordings = np.unique(clips.recordings[clips.kinds == kind])
-        if len(recordings) < FOLDS:
-            continue
-        drawn = zip(range(each * len(names)), rng.spawn(each * len(names)), strict=True)
-        ours = [(rows_of_clip(6000.0, (names[i % len(names)], i, own)).measures, i) for i, own in drawn]
-        simulated = np.concatenate([rows for rows, _ in ours])
-        groups = np.concatenate([np.full(len(rows), i) for rows, i in ours])
-        real, origin = clips.measures[hops], np.searchsorted(recordings, clips.recordings[clips.clip[hops]])
-        half = rng.permutation(len(recordings))[origin] % 2 == 0
-        found[kind] = {
-            "simulated": _apart(simulated, real),
-            "simulated_c2st": _told_apart((simulated, groups), (real, origin), rng),
-            "real": _apart(real[half], real[~half]),
-            "real_c2st": _told_apart((real[half], origin[half]), (real[~half], origin[~half]), rng),
-        }
-        advance()
-    return found
-
-
-def _apart(one: FloatArray, other: FloatArray) -> float:
-    origin = np.repeat([False, True], [len(one), len(other)])
-    areas = [auroc(column, origin) or 0.5 for column in np.concatenate([one, other]).T]
-    return float(np.median(np.abs(np.array(areas) - 0.5)))
-
-
-def _told_apart(
-    one: tuple[FloatArray, IndexArray], other: tuple[FloatArray, IndexArray], rng: np.random.Generator
-) -> float:
-    """Return the area of a boosted classifier over folds by clip or recording."""
-    origin = np.repeat([0, 1], [len(one[0]), len(other[0])])
-    fold = np.concatenate([one[1], other[1]]) % FOLDS
-    return boosted_area(np.concatenate([one[0], other[0]]), origin, fold, rng)
-
-
 def clip_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the report as text."""
     kinds = report["kinds"]
@@ -208,10 +153,6 @@ def clip_lines(report: Mapping[str, Any]) -> list[str]:
         told = f"{one['familiar']:10.2f}{one['foreign']:9.2f}{one['signal']:8.2f}"
         shares = "".join(f"  {share:<10.2f}" for share in one["road_users"].values())
         lines.append(f"{kind:18}{one['recordings']:11}{told}{shares}  {one['moved_by_tilt']:.3f}")
-    for kind, one in report.get("realism", {}).items():
-        apart = f"{one['simulated']:.3f} simulated to real, {one['real']:.3f} real to real"
-        told = f"classifier {one['simulated_c2st']:.2f}, {one['real_c2st']:.2f}"
-        lines.append(f"{kind:18} distance: {apart}; {told}")
     if report["kinds_log_loss"] is None:
         return [*lines, "road users: the table contains none"]
     said = report["said_90"]
@@ -231,19 +172,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("table", type=Path, metavar="TABLE.csv", help="file, kind, recording, road_user")
     add("--numbers", type=Path, metavar="NPZ", help="stored numbers of the clips, instead of their files")
     add("--model", type=Path, metavar="FILE", help="(default: the shipped model)")
-    add(
-        "--simulated",
-        type=int,
-        default=0,
-        metavar="N",
-        help="simulated clips of each kind, compared with the real ones",
-    )
-    add("--seed", type=int, default=0, help="seed of simulated clips (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
-    in_range("--simulated", arguments.simulated, 0, 1000)
     model = read_model(arguments.model)
     if model.guard is None or model.road_users is None:
         raise InvalidArgumentError("--model: expected a model with guard and road users, got one without")
@@ -252,8 +184,4 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     ) as bar:
         clips = read_clips(arguments.table, arguments.numbers, bar.advance)
     report = judged(clips, model.guard, model.road_users)
-    if arguments.simulated:
-        with progress_bar("simulating", len(SIMULATED)) as bar:
-            rng = np.random.default_rng(arguments.seed)
-            report["realism"] = realism_rows(clips, arguments.simulated, rng, bar.advance)
     return CommandResult(report, table={}, lines=clip_lines(report))

@@ -21,7 +21,6 @@ Examples
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,25 +28,17 @@ from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.figure_style import CATEGORIES, figure_file, legend_beside
 from worldstate_lab.report.table import plain
-from worldstate_lab.signatures.clip_signatures import ClipSignatures, draw_band_profile, hear_clips
+from worldstate_lab.signatures.clip_signatures import ClipSignatures, hear_clips
 from worldstate_lab.signatures.signature_study import (
     IDMT,
     MELAUDIS,
-    PAPER_RANGE_HZ,
     QUESTIONS,
     SignatureRow,
     SignatureStudy,
     signature_study,
 )
 from worldstate_lab.signatures.traffic_clips import TrafficClip, idmt_traffic, melaudis
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-CHANCE = 0.5  # For both figures: a row whose interval contains it shows no separation
 
 
 def study_lines(study: SignatureStudy) -> list[str]:
@@ -70,36 +61,6 @@ def study_lines(study: SignatureStudy) -> list[str]:
     return lines
 
 
-def write_signature_figure(path: Path, study: SignatureStudy) -> None:
-    """Draw the measured rows as bars, and the Fisher profile below them."""
-    bars = [row for row in study.rows if row.value is not None and row.figure != "Hz"]
-    # The height of a row is fixed, so that labels of two lines do not overlap.
-    heights = [0.3 * max(len(bars), 1), 2.4] if study.profile is not None else [0.3 * max(len(bars), 1)]
-    with figure_file(path, 9.0, sum(heights) + 1.6) as figure:
-        figure.suptitle("Signatures of single clips")
-        axes = iter(np.atleast_1d(figure.subplots(len(heights), 1, height_ratios=heights)))
-        _draw_bars(next(axes), bars)
-        if study.profile is not None:
-            draw_band_profile(next(axes), study.profile, PAPER_RANGE_HZ)
-
-
-def _draw_bars(axes: "Axes", rows: list[SignatureRow]) -> None:
-    places = np.arange(len(rows))[::-1]
-    for place, row in zip(places, rows, strict=True):
-        value, low, high = (np.nan if one is None else one for one in (row.value, row.low, row.high))
-        colour = CATEGORIES[2 if row.figure == "AUROC" else 1]
-        axes.barh(place, value, color=colour, alpha=0.75, label=row.figure)
-        axes.plot([low, high], [place, place], color="black", linewidth=1.2, label="95 % over recordings")
-        if row.paper is not None:
-            # A single value is a span of zero length, of which the marker is visible.
-            axes.plot(row.paper, [place] * 2, "|-", color=CATEGORIES[3], ms=11, mew=2.5, label="paper")
-    axes.set_yticks(places, [f"{row.name}\n{row.corpus}" for row in rows], fontsize=7.0)
-    axes.axvline(CHANCE, color="grey", linewidth=0.8, linestyle=":", label="chance")
-    axes.set(xlim=(0.0, 1.03), xlabel="AUROC; balanced accuracy if the bar is orange")
-    axes.margins(y=0.01)
-    legend_beside(axes)
-
-
 def _number(value: float | None, row: SignatureRow) -> str:
     if value is None or np.isnan(value):
         return "-"
@@ -108,7 +69,7 @@ def _number(value: float | None, row: SignatureRow) -> str:
 
 Corpora = tuple[ClipSignatures | None, ClipSignatures | None]
 
-NAMES = ("signatures.json", "signatures.txt", "signatures.png")
+NAMES = ("signatures.json", "signatures.txt")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -138,7 +99,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if arguments.out is not None:
         write_report(arguments.out / NAMES[0], report)
         write_text(arguments.out / NAMES[1], "\n".join(lines) + "\n")
-        write_signature_figure(arguments.out / NAMES[2], study)
     return CommandResult(report, table={}, lines=lines)
 
 

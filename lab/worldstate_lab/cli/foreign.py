@@ -13,7 +13,7 @@ the ambience, from 250 to 2600 Hz over one second.
 
 Examples
 --------
-  worldstate-lab foreign SA1-busy-1.npz SB1-busy-1.npz SB2-busy-1.npz --out foreign
+  worldstate-lab foreign SA1-busy-1.npz SB1-busy-1.npz SB2-busy-1.npz
 """
 
 import argparse
@@ -24,8 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.abduction.road_users import DomainGuard, Foreign, WarningSignal
-from worldstate.adapters.files.file_io import write_text
-from worldstate.cli.common.output import CommandResult, output_folder, write_report
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.guard_training import (
     CC0_THRESHOLD,
@@ -134,7 +133,6 @@ def _code(guard: DomainGuard, measures: FloatArray) -> float:
     return _FOREIGN if isinstance(verdict, Foreign) else 0.0
 
 
-NAMES = ("foreign_sounds.json", "foreign_sounds.txt")
 CLIPS_EACH, GUARD_RATE_HZ = 8, 6000.0  # The same number in every fold
 SITES = 3  # Minimum: one evaluated site and two that set its threshold
 
@@ -146,14 +144,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("streams", type=Path, nargs="+", metavar="NPZ", help=heard)
     add("--sounds", type=int, default=2, metavar="N", help="of each kind per site (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of the sounds (default: %(default)s)")
-    add("--out", type=Path, metavar="DIR", help=f"write {', '.join(NAMES)}")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
     in_range("--sounds", arguments.sounds, 1, 100)
-    if arguments.out is not None:
-        output_folder(arguments.out, *NAMES)
     streams = [HeardStream.load(path) for path in arguments.streams]
     sites = sorted({str(stream.hops.about["site"]) for stream in streams})
     if len(sites) < SITES:
@@ -167,7 +162,4 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     heads = ("guard without", "kind", "hops", "foreign", "signal", "worst site")
     lines = Table("guards", "", heads, [astuple(one) for one in found]).lines()[1:]
     report = {"sites": sites, "seed": arguments.seed, "rows": [asdict(one) for one in found]}
-    if arguments.out is not None:
-        write_report(arguments.out / NAMES[0], report)
-        write_text(arguments.out / NAMES[1], "\n".join(lines) + "\n")
     return CommandResult(report, table={}, lines=lines)

@@ -5,42 +5,32 @@ van, truck, tram, motorcycle, bicycle) at junctions outside the training. Hops w
 below the ambience belong to the class *unknown*. Figures cover the hops from 3 s before to 1.5 s after line
 of sight, with the kinds as frequent as in a town.
 
---streams evaluates such hops of streams with one vehicle alone; the streams must be of other junctions than
-the drawn ones.
-
 Examples
 --------
   worldstate-lab kinds --junctions 16 --passes 2 --jobs 2
 """
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
-from worldstate.commissioning.guard_training import close_rows, heard_characters
-from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams
+from worldstate.commissioning.guard_training import close_rows
+from worldstate.commissioning.heard_stream import CommissionSettings, learned_streams
 from worldstate.commissioning.road_user_training import (
     CLASSES,
-    FIRST_S,
-    LAST_S,
     RoadUserRows,
     cross_validated,
-    fit_road_users,
     road_user_rows,
     town_shares,
     with_close,
 )
-from worldstate.commissioning.sequence_training import AUDIBLE_DB
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
 
-_ALONE_DB, _SILENT_DB = 6.0, -100.0
 CLIPS_EACH = 20
 
 
@@ -64,36 +54,6 @@ def road_user_exam(rows: RoadUserRows) -> RoadUserExam:
     """Evaluate every site with a model trained without it, kinds as frequent as in a town."""
     near = rows.select(rows.counts)
     return _examined(near, cross_validated(rows)[rows.counts], near.weights, town_shares(near))
-
-
-def stream_exam(rows: RoadUserRows, streams: Sequence[HeardStream]) -> RoadUserExam:
-    """Evaluate hops of streams with a model of other sites."""
-    heard = RoadUserRows.joined([stream_rows(one) for one in streams])
-    said = fit_road_users(rows).probabilities(heard.measures)
-    return _examined(heard, said, np.ones(len(said)), town_shares(rows))
-
-
-def stream_rows(stream: HeardStream) -> RoadUserRows:
-    """Return the hops of a stream in which one vehicle that comes into view is audible alone."""
-    measures, usable = heard_characters(stream)
-    time_s, vehicles, rows = stream.hops.time_s, stream.vehicles, stream.rows
-    levels = np.full((len(vehicles) + 1, len(time_s)), _SILENT_DB)
-    hop, inside = stream.row_hops()
-    for number, vehicle in enumerate(vehicles.vehicle):
-        mine = inside & (rows.vehicle == vehicle)
-        levels[number, hop[mine]] = rows.loudness_db[mine]
-    loudest = levels[:-1].argmax(axis=0)
-    first, second = np.sort(levels, axis=0)[[-1, -2]]
-    after_s = time_s - vehicles.entry_s[loudest]
-    comes = vehicles.hazard[loudest] & (after_s >= FIRST_S) & (after_s <= LAST_S)
-    kept = usable & comes & (first - second >= _ALONE_DB)
-    return RoadUserRows(
-        measures[kept[usable]],
-        vehicles.kind[loudest][kept],
-        np.full(int(kept.sum()), str(stream.hops.about["site"])),
-        first[kept] >= AUDIBLE_DB,
-        np.ones(int(kept.sum()), np.bool_),
-    )
 
 
 def _examined(near: RoadUserRows, said: FloatArray, weights: FloatArray, shares: FloatArray) -> RoadUserExam:
@@ -127,7 +87,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--junctions", type=int, default=16, metavar="N", help="random junctions (default: %(default)s)")
     of_each = "passes of each kind per junction (default: %(default)s)"
     add("--passes", type=int, default=2, metavar="N", help=of_each)
-    add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="processed streams")
     add("--seed", type=int, default=0, help="seed of vehicles and drives (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
@@ -148,8 +107,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     # Close passes with other recorders, as in a made model: part of the training, and of no evaluated
     # junction.
     rows = with_close(rows, close_rows(rate_hz, rng, CLIPS_EACH, jobs))
-    streams = [HeardStream.load(path) for path in arguments.streams]
-    found = stream_exam(rows, streams) if streams else road_user_exam(rows)
+    found = road_user_exam(rows)
     report = {name: np.asarray(one).tolist() for name, one in asdict(found).items()}
     summary = {name: round(getattr(found, name), 3) for name in ("log_loss", "prior_log_loss", "worst_site")}
     named = zip(found.classes, found.shares, found.hops, found.recall, found.recall_of_equals, strict=True)

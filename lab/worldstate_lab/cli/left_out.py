@@ -4,13 +4,13 @@ The streams are those of `worldstate model make`; streams in the folder --stream
 renderer is left out once: a window and a sequence model are trained on the streams of the other two, as in
 `model make`, and evaluated on all streams of the one that is left out.
 
-Figures are compared at equal onsets: the threshold is the lowest with at most --onsets per hour in the
-left-out renderer's own hazard-free streams, without misleading traffic. The output has for each renderer:
-approaches detected and their lead, those in advisory in the last second before T0 and in the last hop, onsets
-per hour, Brier skill of the probabilities at 1, 2 and 3 s, the share of detected approaches whose first
-advisory has the side of the first vehicle (both sides at once excluded), and detections without a wall
-opposite. "learned alarm" is the threshold that the streams of the other two renderers set, which a user would
-have.
+Figures are compared at equal onsets: the threshold is the lowest with at most 30 onsets per hour (a moving
+ego: 40) in the left-out renderer's own hazard-free streams, without misleading traffic. The output has for
+each renderer: approaches detected and their lead, those in advisory in the last second before T0 and in the
+last hop, onsets per hour, Brier skill of the probabilities at 1, 2 and 3 s, the share of detected approaches
+whose first advisory has the side of the first vehicle (both sides at once excluded), and detections without a
+wall opposite. "learned alarm" is the threshold that the streams of the other two renderers set, which a user
+would have.
 
 Examples
 --------
@@ -29,7 +29,6 @@ import numpy as np
 from worldstate import adapters, frontend
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.adapters.datasets.feature_table import FeatureTable, read_ids
 from worldstate.cli.common.inputs import add_array_options
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
@@ -65,6 +64,7 @@ from worldstate.operations.metrics.approach_table import ApproachTable, Figures,
 from worldstate_lab.report.table import figure_lines
 
 NEEDS = ("sklearn",)
+MINUTES = 7.2  # Minutes with approaches per junction
 ONSETS = {False: 30.0, True: 40.0}  # Per hour, by whether the ego moves
 # Windows and trees of every fold, the alarm, the window model, and the start of the evaluation.
 STEPS = 2 * FOLDS + 3
@@ -85,13 +85,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--streams", type=Path, required=True, metavar="D", help="folder of the processed streams")
     add("--moving-ego", action="store_true", help="the ego drives up to the corner instead of standing")
     add("--junctions", type=int, default=12, metavar="N", help="number per renderer (default: %(default)s)")
-    minutes = "minutes with approaches per junction; hazard-free streams in proportion (default: %(default)g)"
-    add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
-    onsets = "onsets per hour for the comparison (default: 30, with a moving ego 40)"
-    add("--onsets", type=float, metavar="N", help=onsets)
-    add("--labelled", type=Path, metavar="CSV", help="labelled windows of this array, also for training")
-    ids = "CSV files with a column ID: exclude the labelled windows of these recordings"
-    add("--exclude", type=Path, nargs="+", default=[], metavar="IDS", help=ids)
     add("--seed", type=int, default=1, help="seed of streams and trees (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
 
@@ -104,7 +97,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     plan, streams = learned_streams(settings), list[HeardStream]()
     if not any(one.traffic.hazard_free and not one.traffic.name.startswith(MISLEADING) for one in plan):
         raise InvalidArgumentError("--junctions: expected 3 or more to set the threshold")
-    rng, own = np.random.default_rng(settings.seed), own_windows(array, settings, _labelled(arguments))
+    rng, own = np.random.default_rng(settings.seed), own_windows(array, settings, None)
     fit = fit_of(windows_to_learn(array, settings, *own, rng, arguments.jobs))
     with progress_bar("listening", sum(one.minutes for one in plan)) as bar:
         heard = heard_streams(plan, array, arguments.streams, arguments.jobs)
@@ -122,19 +115,12 @@ def _settings(arguments: argparse.Namespace) -> CommissionSettings:
     moves: bool = arguments.moving_ego
     return CommissionSettings(
         junctions=arguments.junctions,
-        approach_minutes=arguments.minutes,
-        hazard_free_minutes=arguments.minutes / 1.2,
-        onsets_per_hour=ONSETS[moves] if arguments.onsets is None else arguments.onsets,
+        approach_minutes=MINUTES,
+        hazard_free_minutes=MINUTES / 1.2,
+        onsets_per_hour=ONSETS[moves],
         seed=arguments.seed,
         moving_ego=moves,
     )
-
-
-def _labelled(arguments: argparse.Namespace) -> FeatureTable | None:
-    if arguments.labelled is None:
-        return None
-    table = adapters.read_features(arguments.labelled).group("dynamic" if arguments.moving_ego else "static")
-    return table.without([name for path in arguments.exclude for name in read_ids(path)])
 
 
 def left_out_row(

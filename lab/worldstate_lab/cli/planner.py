@@ -9,8 +9,7 @@ has collisions, unnecessary braking, and time.
 
 Examples
 --------
-  worldstate-lab planner streams/*-200[23]*.npz --set-on streams/*-approaches-2001*.npz --cache chances
-  worldstate-lab planner streams/SB1-*.npz --threshold 0.005 --count 100 --figure planner.png
+  worldstate-lab planner streams/*-200[23]*.npz --set-on streams/*-approaches-2001*.npz --figure planner.png
 """
 
 import argparse
@@ -22,7 +21,6 @@ import numpy as np
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.output import CommandResult, check_outputs
 from worldstate.cli.common.progress import track
-from worldstate.ground.checks import in_range
 from worldstate.ground.parallel import in_processes
 from worldstate_lab.planner.encounters import FROM_STANDING, BelievedStream, EgoVehicle, believed_stream
 from worldstate_lab.planner.planner_exam import (
@@ -37,23 +35,20 @@ from worldstate_lab.planner.planner_exam import (
 )
 from worldstate_lab.report.table import figure_lines
 
+COUNT = 1000  # Approaches, and corners without one
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("streams", type=Path, nargs="+", metavar="NPZ", help="streams with and without approaches")
-    set_on = parser.add_mutually_exclusive_group(required=True)
     of_others = "streams of other seeds, for the threshold: a step below the largest without a collision"
-    set_on.add_argument("--set-on", type=Path, nargs="+", metavar="NPZ", help=of_others)
-    chance = "chance within three seconds at which a vehicle is assumed"
-    set_on.add_argument("--threshold", type=float, metavar="P", help=chance)
+    add("--set-on", type=Path, nargs="+", required=True, metavar="NPZ", help=of_others)
     add("--model", type=Path, metavar="JSON", help="model with a sequence (default: the shipped one)")
-    add("--count", type=int, default=1000, help="approaches, and corners without one (default: %(default)s)")
     standing = (
         "the car starts at rest 3.5 m before the line, where the states were recorded, not 30 m at 25 km/h"
     )
     add("--from-standing", action="store_true", help=standing)
-    add("--cache", type=Path, metavar="DIR", help="folder for the chances of each stream")
     add("--seed", type=int, default=0, help="seed of the replays (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
     add("--figure", type=Path, metavar="PNG", help="draw one approach, one empty corner, and all thresholds")
@@ -62,15 +57,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
     check_outputs(arguments, figures=("figure",))
-    count = int(in_range("--count", arguments.count, 10, 100_000))
     ego = FROM_STANDING if arguments.from_standing else EgoVehicle()
     rng = np.random.default_rng(arguments.seed)
-    others = _believed(arguments, arguments.set_on or [])
-    chance = for_loud = arguments.threshold
-    if others:
-        loud, quiet = approaches_drawn(others, count, ego, rng)
-        chance, for_loud = safe_threshold([loud, quiet], ego), safe_threshold([loud], ego)
-    corners = draw_corners(_believed(arguments, arguments.streams), count, ego, rng)
+    loud, quiet = approaches_drawn(_believed(arguments, arguments.set_on), COUNT, ego, rng)
+    chance, for_loud = safe_threshold([loud, quiet], ego), safe_threshold([loud], ego)
+    corners = draw_corners(_believed(arguments, arguments.streams), COUNT, ego, rng)
     planners = every_planner(corners, chance, for_loud, ego)
     named = {f"{one:g}": drives_of(corners, one, ego) for one in THRESHOLDS[::2]}
     told = planner_figures(corners, planners | named, rng)
@@ -83,5 +74,5 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _believed(arguments: argparse.Namespace, paths: list[Path]) -> list[BelievedStream]:
-    follow = partial(believed_stream, model=read_model(arguments.model), cache=arguments.cache)
+    follow = partial(believed_stream, model=read_model(arguments.model))
     return list(track(in_processes(follow, paths, arguments.jobs), "following", len(paths)))

@@ -17,7 +17,7 @@ informative.
 
 Examples
 --------
-  worldstate-lab reach --array mics.xml --snr-db -5 --figure bounds.png
+  worldstate-lab reach --array mics.xml --snr-db -5
   worldstate-lab reach --features features.csv --json
   worldstate sim make --out sim --static 40 && worldstate-lab reach --recordings sim
 """
@@ -25,7 +25,6 @@ Examples
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,53 +32,14 @@ from worldstate.adapters.datasets.feature_extraction import read_windows, sample
 from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.cli.common.command import add_choice
 from worldstate.cli.common.inputs import add_array_options, given_array
-from worldstate.cli.common.output import CommandResult, check_outputs
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
 from worldstate.cli.model.fit import add_group
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.checks import in_range
-from worldstate.operations.figure_style import figure_file, legend_beside
 from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData, reach_of_array, reach_on_table
 from worldstate_lab.report.table import plain
-from worldstate_lab.signatures.clip_signatures import BandProfile, band_profile, draw_band_profile
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-def write_identifiability_figure(
-    path: Path, array: ReachOfArray, data: ReachOnData | None, bands: BandProfile | None
-) -> None:
-    """Draw one panel for each requested part, in the format of the ending of `path`."""
-    panels = 1 + (data is not None) + (bands is not None)
-    with figure_file(path, 5.2 * panels, 3.4) as figure:
-        axes = iter(np.atleast_1d(figure.subplots(1, panels)))
-        _draw_array(next(axes), array)
-        if data is not None:
-            _draw_data(next(axes), data)
-        if bands is not None:
-            draw_band_profile(next(axes), bands, bands.range_hz)
-
-
-def _draw_array(axes: "Axes", array: ReachOfArray) -> None:
-    azimuth_deg = np.degrees(array.azimuths_rad)
-    for label, std_rad in (("sound alone", array.std_rad), ("with camera", array.with_vision_rad)):
-        known = np.isfinite(std_rad)
-        axes.semilogy(azimuth_deg[known], np.degrees(std_rad[known]), marker="o", label=label)
-    axes.set(xlabel="azimuth, left positive (deg)", ylabel="smallest std of a bearing (deg)")
-    legend_beside(axes)
-
-
-def _draw_data(axes: "Axes", data: ReachOnData) -> None:
-    values = {
-        "classifier's error": data.error,
-        "bound on any error": data.sharp_fano,
-        "information / entropy, at most": data.information_high / data.entropy_bits,
-        "information / entropy, at least": data.information_lower / data.entropy_bits,
-    }
-    axes.barh(list(values), list(values.values()))
-    axes.set(xlim=(0.0, 1.0), xlabel=f"share ({data.windows} windows, {data.states} classes)")
-
+from worldstate_lab.signatures.clip_signatures import BandProfile, band_profile
 
 # Up to endfire of a transverse array, at which the bound diverges.
 AZIMUTHS_DEG = tuple(range(-90, 91, 15))
@@ -98,15 +58,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--snapshots", type=int, default=20, metavar="N", help="number of snapshots (default: %(default)s)")
     add("--camera-std", type=float, default=1.0, metavar="DEG", help="of its bearings (default: %(default)g)")
     add("--seed", type=int, default=0, help="seed of folds and bootstrap (default: %(default)s)")
-    add("--figure", type=Path, metavar="PNG", help="draw the results")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
-    check_outputs(arguments, figures=("figure",))
     array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
-    if arguments.figure is not None:
-        write_identifiability_figure(arguments.figure, array, data, bands)
     found = {"array": array, "features": data, "bands": bands}
     report = {name: plain(one) for name, one in found.items() if one is not None}
     return CommandResult(report, table={}, lines=_lines(array, data, bands))

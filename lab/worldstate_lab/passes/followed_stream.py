@@ -165,28 +165,20 @@ CameraKind = Literal["all", "cars", "none", "dies"]
 EVERYBODY = DetectionFilter(frozenset({"car", "truck", "bus", "train", "motorcycle", "bicycle"}), 0.5, 20.0)
 
 
-def passed_stream(
-    path: Path,
-    model: Model,
-    camera: CameraKind = "all",
-    seed: int = 0,
-    alpha: float = 0.02,
-    *,
-    learns: bool = True,
-) -> PassedStream:
+def passed_stream(path: Path, model: Model, camera: CameraKind = "all", seed: int = 0) -> PassedStream:
     """Return a stream with the filter's beliefs at every hop; `seed` draws the camera's misses.
 
-    By default, the filter learns the sound of each arm from the vehicles that come into view.
+    The filter learns the sound of each arm from the vehicles that come into view.
 
     Raises
     ------
     InvalidArgumentError
         If the model has no sequence model; `commission` makes one.
     """
-    street = street_listener(model.domain, None, None) if learns else None
+    street = street_listener(model.domain, None, None)
     heard, measured = stream_measurements(path, model, camera, seed, street)
     settings = FilterSettings(street=model.street or StreetModel())
-    world = WorldFilter(Context(), model.policies.for_alpha(alpha), settings)
+    world = WorldFilter(Context(), model.policies.for_alpha(0.02), settings)
     return PassedStream(heard, stream_truth(heard), followed(world, measured, street))
 
 

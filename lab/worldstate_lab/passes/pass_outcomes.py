@@ -39,7 +39,6 @@ from worldstate.ground.typing import AnyArray, BoolArray, FloatArray
 from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
     HORIZON_S,
-    LONGEST_LEAD_S,
     SLACK_S,
     ApproachOutcome,
     ApproachTable,
@@ -105,7 +104,6 @@ def _half_second(power: AnyArray) -> FloatArray:
 
 
 EXISTS, NEAR_RAD, SEEN_AFTER_S = 0.5, np.radians(10.0), 1.0
-RISKS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7)
 HIDDEN_S, KEPT_S, KEPT_RAD = 3.0, 3.0, np.radians(20.0)
 
 
@@ -175,25 +173,19 @@ def seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
 def pass_figures(streams: Sequence[PassedStream]) -> Figures:
     """Return the figures of several streams together, for a table and for JSON."""
     advised = [(one.heard, one.followed.advisory) for one in streams]
-    table, short = (approach_table(advised, longest_s).loud() for longest_s in (HORIZON_S, LONGEST_LEAD_S))
-    figures, former = (one.detections() | one.sides() for one in (table, short))
+    table = approach_table(advised, HORIZON_S).loud()
+    figures = table.detections() | table.sides()
     named = ("approaches", "detected", "lead_missed_as_0_s", *table.sides())
     false = table.false_alarms()
     return {
         **{name: figures[name] for name in named},
         **table.standing(),
-        **{f"{name}_5s": former[name] for name in named if name in _OF_FIVE_SECONDS},
         **_entities(streams, table),
         **{name: false[name] for name in ("hazard_free_hours", "onsets_per_hour", "hazard_free_share")},
         **_ahead(streams) | _forecast(streams) | _bearing(streams) | _kept(streams),
         **_leaving(streams) | _certain(streams),
         **_meter(streams, false["onsets_per_hour"]),
     }
-
-
-# Figures with a limit of 5 s before T0, for comparison with earlier results; alarms now count from the
-# horizon of the risk on.
-_OF_FIVE_SECONDS = ("detected", "lead_missed_as_0_s", "other_side_too", "both_sides_found")
 
 
 def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
@@ -208,16 +200,6 @@ def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
         "identity_kept": mean_of(judged),
         "onset_after_pass": mean_of([one.onsets_after > 0 for one in table.of_flow("single").outcomes]),
     }
-
-
-def sides_by_risk(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
-    """Return how often the other side of a single vehicle, and both sides of two, reach a risk before T0."""
-    names = ("other_side_too", "both_sides_found", "both_near_found")
-    found = {}
-    for least in RISKS:
-        table = approach_table([(one.heard, one.followed.risk >= least) for one in streams]).loud()
-        found[f"risk {least:g}"] = {name: table.sides()[name] for name in names}
-    return found
 
 
 def onsets_by_traffic(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
@@ -363,7 +345,6 @@ WITHIN_S, NOTICED_DB, STATED = 3.0, 1.0, 0.3
 JUST_LEFT_S = 2.0  # A vehicle that left the view remains loud, and masks others, for this long
 SIDES_OF = ("other", "behind")
 GAPS_S = {"below 1.5 s": (0.0, 1.5), "1.5 to 4 s": (1.5, 4.0)}
-BEFORE_S = (3.0, 2.0, 1.5, 1.0, 0.5, 0.1, -0.4)
 COLUMNS = ("behind", "since", "gap_s", "added_db", "chance", "comes", "masked")
 
 
@@ -473,19 +454,3 @@ def _seen_after(stream: PassedStream, entry_s: float) -> str | None:
     later = int(np.searchsorted(stream.followed.time_s, entry_s + SEEN_AFTER_S))
     found = seen_at(stream, vehicle_at(stream.heard, entry_s), min(later, len(stream.followed.time_s) - 1))
     return None if found is None else found.id
-
-
-def hearing_allows(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
-    """Return the median level added by second vehicles, in dB, by time before their own T0, side and gap."""
-    found: dict[str, Figures] = {f"{-before:g} s": {} for before in BEFORE_S}
-    pairs = [(s, one, added) for s in streams for one, added in _loud(s) if len(one.entries_s) > 1]
-    for (behind, side), (gap, (low, high)) in product(enumerate(SIDES_OF), GAPS_S.items()):
-        mine = [
-            np.interp(one.entries_s[1] - np.array(BEFORE_S), stream.followed.time_s, added)
-            for stream, one, added in pairs
-            if (one.sides[0] == one.sides[1]) == behind and low <= one.entries_s[1] - one.entries_s[0] < high
-        ]
-        medians = np.median(mine, axis=0).tolist() if mine else [None] * len(BEFORE_S)
-        for figures, median in zip(found.values(), medians, strict=True):
-            figures[f"{side}, {gap} ({len(mine)})"] = median
-    return found

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +11,14 @@ from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.commissioning.stream_exam import approaches
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import StreamApproach
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate_lab.passes.followed_stream import passed_stream
-from worldstate_lab.trials.pass_cache import PassCache, content_hash
 
 GONE_M = -1e3
-_CHANCES = "chances"
 _SPEED_ROWS = 5
 
 
@@ -63,19 +59,11 @@ class BelievedStream:
     others: IndexArray  # Numbers of all other vehicles
 
 
-def believed_stream(path: Path, model: Model, cache: Path | None) -> BelievedStream:
-    """Return a stream with its chances, cached in a folder by the content of stream and model."""
-    follow = partial(_chances, path, model)
-    if cache is None:
-        return with_chances(HeardStream.load(path), follow()[_CHANCES])
-    # The key does not include the filter's code: after a change of the code, use another folder.
-    marks = [content_hash(path), encode(model)]
-    return with_chances(HeardStream.load(path), PassCache(cache).tables(_CHANCES, marks, follow)[_CHANCES])
-
-
-def _chances(path: Path, model: Model) -> dict[str, HopTable]:
+def believed_stream(path: Path, model: Model) -> BelievedStream:
+    """Return a stream with its chances."""
     followed = passed_stream(path, model).followed
-    return {_CHANCES: HopTable({"time_s": followed.time_s, "within": followed.within.astype(np.float32)})}
+    chances = HopTable({"time_s": followed.time_s, "within": followed.within.astype(np.float32)})
+    return with_chances(HeardStream.load(path), chances)
 
 
 def with_chances(heard: HeardStream, chances: HopTable) -> BelievedStream:

@@ -7,7 +7,7 @@ taxonomic problems", 1936.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,6 @@ from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
-from worldstate.operations.figure_style import legend_beside
 
 from .traffic_clips import BACKGROUND, ClipLabels, TrafficClip, read_clip
 
@@ -118,10 +117,6 @@ def _heard(clip: TrafficClip) -> FloatArray | str:
     return signature(samples, rate_hz)
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class BandProfile:
     """Fisher ratio of every band between windows with a vehicle and without one."""
@@ -145,21 +140,6 @@ def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArr
     if edges_hz is None:
         raise InvalidArgumentError("windows: expected at least two with a vehicle and two without")
     return profile_of(np.array(rows), vehicle, edges_hz)
-
-
-def draw_band_profile(axes: "Axes", profile: BandProfile, shaded_hz: tuple[float, float]) -> None:
-    """Draw the ratios of a profile over its bands, with a shaded range: that of the shape, or the paper's."""
-    low, high = shaded_hz
-    axes.axvspan(low, high, color="0.9", linewidth=0, label=f"{low:.0f}-{high:.0f} Hz")
-    axes.stairs(profile.by_level, profile.edges_hz, label="level", baseline=None)
-    axes.stairs(profile.by_shape, profile.edges_hz, label="shape", baseline=None)
-    axes.set(xscale="log", xlabel="frequency (Hz)", ylabel="Fisher ratio,\nvehicle against none")
-    # With ticks at decades only, a span of two decades would have three labels.
-    axes.set_xlim(profile.edges_hz[0], profile.edges_hz[-1])
-    axes.set_xticks([50, 100, 300, 1000, 1800, 4000, 8000], ["50", "100", "300", "1k", "1.8k", "4k", "8k"])
-    axes.minorticks_off()
-    axes.set_ylim(bottom=0.0)
-    legend_beside(axes)
 
 
 def profile_of(energy: FloatArray, vehicle: BoolArray, edges_hz: FloatArray) -> BandProfile:

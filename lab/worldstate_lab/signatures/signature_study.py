@@ -11,7 +11,6 @@ from worldstate.operations.metrics.approach_table import auroc
 from worldstate_lab.metrics.intervals import FOLDS, Interval, auroc_by_group, middle, pooled_draws
 
 from .clip_signatures import (
-    BandProfile,
     ClipSignatures,
     discriminative_range_hz,
     level_invariant_shape,
@@ -185,10 +184,9 @@ class SignatureRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignatureStudy:
-    """All figures, the worst first, and the Fisher profile of the roadside corpus."""
+    """All figures, the worst first."""
 
     rows: tuple[SignatureRow, ...]
-    profile: BandProfile | None
     left_out: tuple[str, ...]  # Reasons why clips could not be read
 
 
@@ -205,12 +203,9 @@ def signature_study(
     given: dict[Corpus, ClipSignatures | None] = {IDMT: roadside, MELAUDIS: city}
     tables = {name: one for name, one in given.items() if one is not None}
     rows, ranges = _rows(tables, rng, on_row)
-    studio = _studio(roadside)
-    known = studio is not None and enough(studio)
-    profile = profile_of(studio.energy, studio.motor, signature_edges_hz()) if studio and known else None
     left_out = tuple(problem for one in tables.values() for problem in one.left_out)
     worst_first = sorted(rows, key=lambda row: (row.value is None, row.value))
-    return SignatureStudy((*worst_first, *ranges), profile, left_out)
+    return SignatureStudy((*worst_first, *ranges), left_out)
 
 
 def _rows(

@@ -4,9 +4,7 @@ FOLDER has truth.csv (file, site, side, kind, seconds) and the recordings; MODEL
 time of coming into view is unknown, and outdoor recordings continue after it. Three questions are evaluated:
 
 - the side of each vehicle outdoors in the second half of its recording: the side with the larger mean
-  published risk; for comparison, the side by the window's log ratios and by the sign of the surest 16 % of
-  the bearings, which need no model; and each of these over the hops until the loudest one, because in many
-  second halves the vehicle has passed and drives away on the other side;
+  published risk;
 - the area under the ROC curve of 1 - P(none) of the hops in the last two seconds against those in the first
   two of the same recording, averaged over recordings of 5 s and more;
 - advisories by kind: one for a person is a failure of the guard.
@@ -45,19 +43,16 @@ from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.ground.values import seconds
 from worldstate.operations.metrics.approach_table import Figures, auroc, mean_of, share_interval
-from worldstate_lab.metrics.intervals import highest_share, stratified_draws
+from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.report.table import MISSING, Table, Value, cell_text
 
 BUFFER = 1024
 # Band of the comparison for lost buffers: wind below, little sound of vehicles above.
 _BAND_HZ = (200.0, 6000.0)
-# Share of the bearings that the paper uses as the surest.
-_SUREST = 0.16
 _ENDS_S, _LEAST_S = 2.0, 5.0
 _PERSONS = ("human", "man", "woman")
 _OUTDOORS, _UNSCORED = "OA", ("cart", "")
 _CENTRAL = (0.025, 0.975)
-_SINCE_HALF, _UNTIL_LOUDEST = "second half", "until the loudest hop"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +87,7 @@ class BoardOutcome:
     recording: BoardRecording
     hops: int
     buffers: tuple[int, ...]  # Lost buffers of each channel
-    sides: Mapping[str, str | None]  # By source of the side and by hops
+    side: str | None
     rise: float | None  # AUROC of the last two seconds against the first two
     advised: bool
 
@@ -152,45 +147,20 @@ def outcome(
     told = [one.state.cues[0].hypotheses for one in steps]
     present = np.array([np.nan if one is None else 1.0 - one.none for one in told])
     advised = any(cue.advisory is not None for one in steps for cue in one.state.cues)
-    late = [one for one, at_s in zip(steps, time_s, strict=True) if at_s > 0.5 * duration_s]
-    loudness = [one.frame.band_log_energy.mean() for one in steps]
-    spans = {_SINCE_HALF: late, _UNTIL_LOUDEST: steps[: int(np.argmax(loudness)) + 1]}
-    sides = {f"{name}, {span}": read(hops) for span, hops in spans.items() for name, read in _READ.items()}
+    side = _of_risk([one for one, at_s in zip(steps, time_s, strict=True) if at_s > 0.5 * duration_s])
     ends = time_s > duration_s - _ENDS_S
     kept = ends | (time_s <= _ENDS_S)
     rise = auroc(present[kept], ends[kept]) if duration_s >= _LEAST_S else None
-    return BoardOutcome(recording, len(steps), buffers, sides, rise, advised)
-
-
-def _side(leftwards: FloatArray) -> str | None:
-    """Return the side of the mean of the values per hop, left positive; None without values."""
-    mean = float(np.nansum(leftwards))
-    return None if mean == 0.0 else SIDES[0] if mean > 0.0 else SIDES[1]
+    return BoardOutcome(recording, len(steps), buffers, side, rise, advised)
 
 
 def _of_risk(steps: Sequence[Step]) -> str | None:
+    """Return the side with the larger mean risk; None without risks."""
     risks = [
         {cue.direction: np.nan if cue.risk is None else cue.risk for cue in one.state.cues} for one in steps
     ]
-    return _side(np.array([one[SIDES[0]] - one[SIDES[1]] for one in risks]))
-
-
-def _of_window(steps: Sequence[Step]) -> str | None:
-    known = [one.measurement.signature.sides for one in steps]
-    return _side(np.array([one.log_ratios[0] - one.log_ratios[1] for one in known if one is not None]))
-
-
-def _of_bearing(steps: Sequence[Step]) -> str | None:
-    prominence = np.array([one.frame.prominence for one in steps])
-    surest = highest_share(prominence, np.ones((1, len(steps))), _SUREST)[0]
-    return _side(np.sign([one.frame.bearing_rad for one in steps])[surest])
-
-
-_READ = {"risk": _of_risk, "window": _of_window, "bearing": _of_bearing}
-
-
-# The scored side; the others are for comparison.
-_MAIN = f"risk, {_SINCE_HALF}"
+    leftwards = float(np.nansum([one[SIDES[0]] - one[SIDES[1]] for one in risks]))
+    return None if leftwards == 0.0 else SIDES[0] if leftwards > 0.0 else SIDES[1]
 
 
 def run_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> dict[str, Any]:
@@ -198,12 +168,10 @@ def run_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> d
     scored = [one for one in outcomes if one.recording.scored]
     cars = [one for one in scored if one.recording.drives_outdoors]
     persons = [one for one in scored if one.recording.kind in _PERSONS]
-    by_form = {form: side_figures(cars, form) for form in outcomes[0].sides}
     return {
         "by_kind": {name: counts(some) for name, some in _by("kind", scored).items()},
         "by_group": {name: counts(some) for name, some in _by("group", scored).items()},
-        "side": by_form[_MAIN],
-        "side_by": by_form,
+        "side": side_figures(cars),
         "hazard": hazard_figures(cars, rng),
         "persons": {"recordings": len(persons), "advisories": sum(one.advised for one in persons)},
     }
@@ -224,25 +192,25 @@ def counts(outcomes: Sequence[BoardOutcome]) -> Figures:
         "count": len(outcomes),
         "hops": sum(one.hops for one in outcomes),
         "advisories": sum(one.advised for one in outcomes),
-        "side_right": _right(outcomes, _MAIN),
+        "side_right": _right(outcomes),
         "side_of": len(outcomes),
         "hazard_higher": int(np.sum(rises > 0.5)),
         "hazard_of": len(rises),
     }
 
 
-def _right(outcomes: Sequence[BoardOutcome], form: str) -> int:
-    return sum(one.sides[form] == one.recording.side for one in outcomes)
+def _right(outcomes: Sequence[BoardOutcome]) -> int:
+    return sum(one.side == one.recording.side for one in outcomes)
 
 
 def _rises(outcomes: Sequence[BoardOutcome]) -> FloatArray:
     return np.array([one.rise for one in outcomes if one.rise is not None])
 
 
-def side_figures(outcomes: Sequence[BoardOutcome], form: str) -> dict[str, Any]:
+def side_figures(outcomes: Sequence[BoardOutcome]) -> dict[str, Any]:
     """Return the share of right sides, with exact intervals, and the mean recall of both sides."""
-    shares = {name: _share(_right(some, form), len(some)) for name, some in _by("side", outcomes).items()}
-    whole = _share(_right(outcomes, form), len(outcomes))
+    shares = {name: _share(_right(some), len(some)) for name, some in _by("side", outcomes).items()}
+    whole = _share(_right(outcomes), len(outcomes))
     return {**whole, "balanced": _balanced([one["share"] for one in shares.values()]), "by_side": shares}
 
 
@@ -277,14 +245,11 @@ def hazard_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -
 def _lines(title: str, figures: Mapping[str, Any]) -> list[str]:
     names = ("count", "advisories", "side_right", "hazard_higher", "hazard_of")
     rows = [(group, *(str(one[name]) for name in names)) for group, one in figures["by_group"].items()]
-    hazard, persons = figures["hazard"], figures["persons"]
+    side, hazard, persons = figures["side"], figures["hazard"], figures["persons"]
     return [
         "",
         *Table("groups", title, ("by site, side and kind", *names), rows).lines(),
-        *(
-            f"side by {form}: {one['right']} of {one['of']}, {_shown(one, 'share')}"
-            for form, one in figures["side_by"].items()
-        ),
+        f"side: {side['right']} of {side['of']}, {_shown(side, 'share')}",
         f"last 2 s against the first 2 s: AUROC {_shown(hazard, 'auroc')}, {hazard['pairs']} recordings",
         f"persons with an advisory: {persons['advisories']} of {persons['recordings']}",
     ]
