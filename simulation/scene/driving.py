@@ -1,7 +1,5 @@
 """Motion from settings: the position of every vehicle, and when the camera of the ego sees it."""
 
-from functools import partial
-
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -11,7 +9,7 @@ from .junction import Site
 from .kinds import vehicle_kind
 from .occluders import hidden_by
 from .settings import SimulationSettings, VehicleSettings
-from .vehicle import Trajectory, along, drive, follow, turn_in
+from .vehicle import Trajectory, along, drive, follow
 
 
 def image_edges_rad(camera: PinholeCamera) -> tuple[float, float]:
@@ -49,7 +47,6 @@ def camera_sees(
 
 
 SEARCH_STEP_M = 0.1
-TURN_WITHIN_S = 5.0  # Longest time between the start of braking for a turn and line of sight
 
 
 def trajectories(settings: SimulationSettings, time_s: FloatArray) -> list[Trajectory]:
@@ -61,8 +58,9 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
     lane = settings.site.lanes_m[0 if vehicle.approach == "left" else 1]
     ego_x = float(settings.ego.x_m(np.array([vehicle.entry_s]))[0])
     entry_y = entry_y_m(settings.site, lane, vehicle.approach, ego_x)
-    passing = partial(
-        drive,
+    passing = drive(
+        time_s,
+        entry_s=vehicle.entry_s,
         entry_y_m=entry_y,
         lane_x_m=lane,
         speed_mps=vehicle.speed_mps,
@@ -71,15 +69,8 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
     )
     if vehicle.route_m:
         way = along(vehicle.route_m, _first_sight(settings.site, vehicle)[0])
-        return follow(passing(time_s, entry_s=vehicle.entry_s), entry_y, way)
-    if vehicle.manoeuvre == "turn":
-        turn = turn_in(lane, entry_y)
-        # Braking for the turn takes time before line of sight, so the vehicle starts that much earlier.
-        near = vehicle.entry_s + np.arange(-TURN_WITHIN_S, TURN_WITHIN_S, time_s[1] - time_s[0])
-        slowed = follow(passing(near, entry_s=vehicle.entry_s), entry_y, *turn)
-        late = float(np.interp(0.0, slowed.driven_m, near)) - vehicle.entry_s
-        return follow(passing(time_s, entry_s=vehicle.entry_s - late), entry_y, *turn)
-    return passing(time_s, entry_s=vehicle.entry_s)
+        return follow(passing, entry_y, way)
+    return passing
 
 
 def entry_y_m(site: Site, lane_m: float, approach: str, ego_x_m: float = 0.0) -> float:

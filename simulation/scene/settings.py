@@ -194,7 +194,6 @@ class SoundSettings:
 
 
 APPROACHES = ("left", "none", "right")  # OVAD's class numbers 1, 2, 3, in this order
-MANOEUVRES = ("pass", "turn")
 SAMPLE_RATE_HZ = 47_998.0
 MAX_OTHERS, MAX_SOUNDS, MAX_ROUTE_POINTS, SHORTEST_STEP_M = 8, 16, 64, 0.1
 # Fitted to the motion of the released patterns in the two seconds round T0: 3 to 5 m/s at all three fitted
@@ -236,8 +235,6 @@ class VehicleSettings:
         Deceleration in the two seconds before line of sight, 0 to 8.
     kind : str
         One of `KINDS`.
-    manoeuvre : str
-        "pass" or "turn": it turns into the ego's street and stops there.
     route_m : tuple of (float, float)
         Route in place of the crossing street: points x, y, at least 2; empty for none.
     signal : str
@@ -250,7 +247,7 @@ class VehicleSettings:
 
     Examples
     --------
-    >>> VehicleSettings("left", entry_s=4.0, kind="heavy", manoeuvre="turn").speed_mps > 8
+    >>> VehicleSettings("left", entry_s=4.0, kind="heavy").speed_mps > 8
     True
     """
 
@@ -259,14 +256,12 @@ class VehicleSettings:
     speed_mps: float = 30.0 / 3.6
     braking_mps2: float = 0.0
     kind: str = "light"
-    manoeuvre: str = "pass"
     route_m: tuple[tuple[float, float], ...] = ()
     signal: str = ""
 
     def __post_init__(self) -> None:
         one_of("approach", self.approach, ("left", "right"))
         one_of("signal", self.signal, ("", *SIGNALS))
-        one_of("manoeuvre", self.manoeuvre, MANOEUVRES)
         vehicle_kind(self.kind)
         check_ranges(self, entry_s=(-60.0, 120.0), speed_mps=(1.0, 30.0), braking_mps2=(0.0, 8.0))
         if self.route_m:
@@ -301,7 +296,7 @@ class SimulationSettings:
         2 to 96 kHz; sound is rendered up to a third of it.
     preset : Preset
         Levels and spectra of everything else.
-    kind, manoeuvre, route_m, signal
+    kind, route_m, signal
         Of the vehicle: see `VehicleSettings`.
     others : tuple of VehicleSettings
         At most 8 further vehicles; with `approach` "none" they are all, and none of them is a hidden hazard.
@@ -331,7 +326,6 @@ class SimulationSettings:
     sample_rate_hz: float = SAMPLE_RATE_HZ
     preset: Preset = field(default_factory=preset)
     kind: str = "light"
-    manoeuvre: str = "pass"
     route_m: tuple[tuple[float, float], ...] = ()
     others: tuple[VehicleSettings, ...] = ()
     ego: EgoMotion = field(default_factory=EgoMotion)

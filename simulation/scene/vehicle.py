@@ -14,10 +14,6 @@ from .kinds import LIGHT, SILENT_DB, TYRE_M, VehicleKind
 from .octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks, split_octaves
 
 FAR_M = 600.0  # Straight extension of a route at both ends
-TURN_RADIUS_M = 3.5
-LANE_FROM_MIDDLE_M = 1.2  # Lateral position of a vehicle that has turned into the ego's street
-STOP_AHEAD_M = 3.0  # Distance ahead of the ego at which such a vehicle stops
-ARC_STEPS = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,29 +46,6 @@ def along(points_m: ArrayLike, entry_m: float = 0.0) -> Route:
     whole = np.concatenate([[behind], points, [ahead]])
     steps = np.hypot(*np.diff(whole, axis=0).T)
     return Route(np.r_[0.0, np.cumsum(steps)] - FAR_M - entry_m, whole)
-
-
-def turn_in(lane_x_m: float, entry_y_m: float) -> tuple[Route, float]:
-    """Return the route of a vehicle that turns into the ego's street, and its length.
-
-    Examples
-    --------
-    >>> route, end = turn_in(8.0, 4.7)
-    >>> [round(float(v), 2) for v in route.at(end)]
-    [3.0, 1.2]
-    """
-    # The vehicle keeps to its right and stops in front of the ego.
-    side = 1.0 if entry_y_m > 0 else -1.0
-    begin_y = LANE_FROM_MIDDLE_M + side * TURN_RADIUS_M
-    angle = np.linspace(0.0, 0.5 * np.pi, ARC_STEPS)
-    arc_x = lane_x_m - TURN_RADIUS_M * (1.0 - np.cos(angle))
-    arc_y = begin_y - side * TURN_RADIUS_M * np.sin(angle)
-    start = max(abs(entry_y_m), abs(begin_y)) + 1.0
-    points = np.concatenate([[[lane_x_m, side * start]], np.column_stack([arc_x, arc_y])])
-    points = np.concatenate([points, [[min(STOP_AHEAD_M, arc_x[-1] - 0.1), LANE_FROM_MIDDLE_M]]])
-    length = float(np.hypot(*np.diff(points, axis=0).T).sum())
-    entry = start - abs(entry_y_m)
-    return along(points, entry), length - entry
 
 
 BRAKING_MPS2 = 2.5
@@ -158,8 +131,6 @@ WANDER, WANDER_STEP_S = 0.05, 0.5
 # An engine under load is louder, and one that is driven by the wheels is quieter (source model of IMAGINE,
 # light vehicles). Accelerations outside the second pair were not measured.
 LOAD_DB_PER_MPS2, LOADS_MPS2 = 4.4, (-1.0, 2.0)
-TURN_MPS, TURN_BRAKING_MPS2 = 3.5, 2.0
-TURN_BEGINS_M = 12.0  # Longest distance before line of sight at which braking for the turn begins
 SILENCE_DB = 0.0  # An engine with every octave below this level is left out
 
 
@@ -230,24 +201,10 @@ def drive(
     return Trajectory(time_s, front[asked], speed[asked], lane_x_m, heading, kind)
 
 
-def follow(passing: Trajectory, entry_y_m: float, route: Route, end_m: float = np.inf) -> Trajectory:
-    """Return the motion of `passing` along another route, slower before an end of the route."""
-    step = passing.time_s[1] - passing.time_s[0]
+def follow(passing: Trajectory, entry_y_m: float, route: Route) -> Trajectory:
+    """Return the motion of `passing` along another route."""
     driven = (passing.front_y_m - entry_y_m) * passing.heading
-    speed = passing.speed_mps.copy()
-    if np.isfinite(end_m):
-        for i in np.flatnonzero(driven > -TURN_BEGINS_M).tolist():
-            if i:
-                speed[i] = min(speed[i], _turn_speed(driven[i - 1], end_m))
-                driven[i] = min(driven[i - 1] + speed[i] * step, end_m)
-    return replace(passing, front_y_m=route.at(driven)[1], speed_mps=speed, route=route, driven_m=driven)
-
-
-def _turn_speed(driven_m: float, end_m: float) -> float:
-    """Return the highest speed from which the vehicle can still slow down for the turn and its end."""
-    to_turn, to_end = max(-driven_m, 0.0), max(end_m - driven_m, 0.0)
-    turning = np.sqrt(TURN_MPS**2 + 2.0 * TURN_BRAKING_MPS2 * to_turn)
-    return float(min(turning, np.sqrt(2.0 * TURN_BRAKING_MPS2 * to_end)))
+    return replace(passing, front_y_m=route.at(driven)[1], route=route, driven_m=driven)
 
 
 def rolling_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:

@@ -15,7 +15,6 @@ from worldstate.simulation.scene.presets import Preset
 from worldstate.simulation.scene.settings import BRAKING_MPS2, BRAKING_SHARE, SPEEDS_MPS, speeds_mps
 from worldstate.simulation.scene.vehicle import (
     POWER_TO_1M_DB,
-    TURN_RADIUS_M,
     Route,
     Trajectory,
     along,
@@ -78,7 +77,7 @@ def confined(route: Route, near_m: float, far_m: float) -> Route:
     return replace(route, driven_m=driven, points_m=np.column_stack([np.clip(x, near_m, far_m), y]))
 
 
-TURN_MPS, ARC_STEPS = 4.0, 16
+TURN_RADIUS_M, TURN_MPS, ARC_STEPS = 3.5, 4.0, 16
 OWN_LANE_M = 1.8  # Beside the ego, whose half width is 0.9 m, as far as a side wall allows
 KERB_M = 0.95  # Half a vehicle and a hand's breadth
 BESIDE_M, SHORTEST_M = 30.0, 10.0  # Distance over which a vehicle is followed into another street

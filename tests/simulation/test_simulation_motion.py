@@ -1,4 +1,4 @@
-"""A moving ego, a turning vehicle and bodies in the open: Doppler shift, continuity and truth."""
+"""A moving ego and bodies in the open: Doppler shift, continuity and truth."""
 
 import json
 from dataclasses import replace
@@ -120,14 +120,9 @@ def test_omitted_wall_patches_have_little_energy(monkeypatch):
 
 HIDDEN_IN_THE_OPEN = ("SL1", "SP1", "SM1")  # behind a van, a pier, a wall
 SCENES = {
-    "turn": lambda: replace(draw_settings("SA1", "left", np.random.default_rng(3)), manoeuvre="turn"),
     "moving": lambda: draw_settings("DA1", "right", np.random.default_rng(4)),
-    "moving turn": lambda: replace(draw_settings("DB2", "left", np.random.default_rng(5)), manoeuvre="turn"),
     **{name: (lambda n=name: scene_settings(n)) for name in HIDDEN_IN_THE_OPEN},
 }
-
-# "moving turn" includes the paths of "moving".
-SHOWN = [pytest.param(name, marks=[pytest.mark.slow] * (name == "moving")) for name in SCENES]
 
 
 def scene_settings(name: str) -> SimulationSettings:
@@ -149,7 +144,7 @@ def heard(scene: SimulationSettings, sound) -> np.ndarray:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", SHOWN)
+@pytest.mark.parametrize("name", SCENES)
 def test_paths_of_a_moving_ego_change_without_clicks(name):
     """A click would spread a 500-Hz tone beyond 2 kHz."""
     sound = heard(SCENES[name](), tone(500.0))
@@ -160,7 +155,7 @@ def test_paths_of_a_moving_ego_change_without_clicks(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", SHOWN)
+@pytest.mark.parametrize("name", SCENES)
 def test_energy_of_a_moving_ego_is_continuous(name):
     """Noise in windows of 50 ms: no step beyond what 50 ms of movement and chance make, and no gap."""
     power = (heard(SCENES[name](), noise).reshape(200, -1) ** 2).mean(axis=1)
@@ -172,7 +167,7 @@ def test_energy_of_a_moving_ego_is_continuous(name):
 def test_truth_has_route_sight_and_time_of_every_vehicle():
     others = (
         VehicleSettings("right", 4.0, 9.0, kind="heavy"),
-        VehicleSettings("left", 9.0, manoeuvre="turn"),
+        VehicleSettings("left", 9.0),
     )
     drawn = draw_settings("DA2", "left", np.random.default_rng(2))
     # Mirror images cost time and do not affect the truth.
@@ -233,7 +228,6 @@ def test_no_scene_gives_silence_nan_or_a_click(data):
         data.draw(st.floats(1.0, 30.0)),
         data.draw(st.floats(0.0, 8.0)),
         data.draw(st.sampled_from(sorted(KINDS))),
-        data.draw(st.sampled_from(["pass", "turn"])),
         # With bodies these routes would lead through them.
         () if drawn.site.occluders else data.draw(st.sampled_from([(), THROUGH_US, BENT])),
     )
@@ -243,7 +237,6 @@ def test_no_scene_gives_silence_nan_or_a_click(data):
         speed_mps=data.draw(st.floats(1.0, 30.0)),
         braking_mps2=data.draw(st.floats(0.0, 8.0)),
         kind=data.draw(st.sampled_from(sorted(KINDS))),
-        manoeuvre=data.draw(st.sampled_from(["pass", "turn"])),
         others=(other,) * data.draw(st.integers(0, 1)),
         sample_rate_hz=data.draw(st.floats(8_000.0, 16_000.0)),
         ego=EgoMotion(data.draw(st.floats(0.0, 20.0)), data.draw(st.floats(0.0, 120.0))),

@@ -18,7 +18,6 @@ from worldstate.simulation.scene.vehicle import (
     BRAKING_MPS2,
     GEARS_HZ_PER_MPS,
     IDLE_HZ,
-    TURN_MPS,
     EgoMotion,
     Trajectory,
     drive,
@@ -153,27 +152,6 @@ def test_engine_speed_follows_gears_within_five_per_cent(speed, braking, seed):
     idle = np.abs(firing / IDLE_HZ - 1.0)
     assert np.mean(np.minimum(nearest, idle) < 0.051) > 0.85
     assert np.abs(np.diff(np.log(firing))).max() < 0.01  # no jumps
-
-
-@pytest.mark.parametrize("approach", ["left", "right"])
-@pytest.mark.parametrize("speed", [3.0, 8.0, 13.0])
-def test_a_turning_vehicle_stops_before_the_ego(approach, speed):
-    scene = SimulationSettings(
-        site("SA1"), approach, duration_s=20.0, entry_s=7.0, speed_mps=speed, manoeuvre="turn"
-    )
-    (path,) = trajectories(scene, np.linspace(-2.0, 20.0, 8251))
-    x, y = path.behind(0.0)
-    step = np.hypot(np.diff(x), np.diff(y)) / np.diff(path.time_s)
-    assert step.max() < speed * 1.001
-    np.testing.assert_allclose(step, path.speed_mps[1:], atol=0.12 * speed + 0.05)
-    turning = (np.abs(y) < 3.0) & (x < path.lane_x_m - 0.5)
-    assert path.speed_mps[turning].max() < TURN_MPS * 1.1
-    assert 2.0 < x[-1] < 3.05  # beside the bonnet if the near lane has no more room
-    assert y[-1] == pytest.approx(1.2, abs=0.01)
-    assert path.speed_mps[-1] < 0.5
-    straight = trajectories(replace(scene, manoeuvre="pass"), path.time_s)[0]
-    entry = [np.interp(7.0, one.time_s, one.behind(0.0)[1]) for one in (path, straight)]
-    assert entry[0] == pytest.approx(entry[1], abs=0.1)
 
 
 @given(st.floats(0.0, 20.0), st.floats(0.0, 60.0))
