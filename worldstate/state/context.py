@@ -9,7 +9,7 @@ from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.checks import all_of, check_fields, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
-_LEAST_STD_RAD, _FASTEST, _FARTHEST_M = 1e-4, 100.0, 1e6  # The second in Hz or m/s
+_LEAST_STD_RAD, _FASTEST, _FARTHEST_M = 1e-4, 100.0, 1e6  # _FASTEST is in Hz or m/s
 
 _AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (math.ulp(0.0), math.pi)
 _OCCLUDER = {
@@ -24,7 +24,7 @@ _OCCLUDER = {
     "hides": bool,
     "crossing_m": (0.0, 2.0 * _FARTHEST_M, None),
 }
-_PASSED_M = 0.5  # A corner less than this ahead is abeam: a vehicle that passes it is in view
+_PASSED_M = 0.5  # A corner less than this far ahead is abeam: vehicles that pass it are in view
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +196,7 @@ def blind_corner(direction: str, side: int) -> Occluder:
     Returns
     -------
     Occluder
-        On that side.
+        The corner on that side.
 
     Examples
     --------
@@ -289,7 +289,7 @@ def open_side(direction: str, side: int) -> Occluder:
 def seen_from(
     occluder: Occluder, pose: tuple[float, float, float], position_std_m: float, yaw_std_rad: float
 ) -> Occluder:
-    r"""Return an occluder as the ego vehicle has it at a pose (x, y, yaw) in the map frame, m and rad.
+    r"""Return an occluder as seen from the ego vehicle at a pose (x, y, yaw) in the map frame, m and rad.
 
     .. math:: a' = \operatorname{atan2}(y_c - y, x_c - x) - \psi, \qquad
               \sigma_{a'}^2 = \sigma_a^2 + \sigma_{xy}^2 / r^2 + \sigma_\psi^2
@@ -326,7 +326,7 @@ def seen_from(
 
 
 def hidden_behind(ahead_m: float, beside_m: float, pace_hz: float) -> tuple[float, float]:
-    """Return azimuth and deviation of a vehicle behind a corner that comes into view in 2 +- 1 s."""
+    """Return azimuth and standard deviation of a hidden vehicle that comes into view in 2 +- 1 s."""
     slope = abs(beside_m) / ahead_m
     near, middle, far = (math.atan(slope + pace_hz * time_s) for time_s in (1.0, 2.0, 3.0))
     # For a very distant or very near corner the three azimuths are equal.
@@ -374,7 +374,7 @@ class Context:
     LAYOUT: ClassVar = Layout(order="site ego_speed_mps degradation priors")
 
     rates: Rates = Rates()
-    # Without a map a blind junction is assumed, for which the library is made.
+    # Without a map a blind junction is assumed, because the library is made for such junctions.
     occluders: tuple[Occluder, ...] = (blind_corner("left", 1), blind_corner("right", -1))
     priors: Priors | None = None
     ego_speed_mps: float | None = None

@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 from worldstate.ground.serialisation import ADDED, Count, Probability
 
 Condition: TypeAlias = Literal["working", "impaired", "silent"]
-MASKED = "masked by a vehicle in view"  # A reason of `Hearing` that is no fault of the sensor
+MASKED = "masked by a vehicle in view"  # A reason in `Hearing` that is not a fault of the sensor
 
 
 @dataclass(frozen=True, slots=True)

@@ -271,7 +271,7 @@ def why_not(state: WorldState) -> tuple[WhyNot, ...]:
 
 
 def judged(state: WorldState) -> WorldState:
-    """Return a snapshot with `usable` and `why_not` of its cues, and `calibrated`, set by `why_not`.
+    """Return a snapshot in which `usable` and `why_not` of the cues and `calibrated` are set.
 
     Examples
     --------
@@ -312,7 +312,8 @@ def _upgraded(value: Any) -> WorldState:
         cues = [one | new if isinstance(one, dict) else one for one in cues]
     schema = {"name": WorldState.LAYOUT.schema, "version": WorldState.LAYOUT.version}
     state = decode(WorldState, value | {"schema": schema, "cues": cues}, "snapshot")
-    # `calibrated` was false during unusable hops and with a broken budget, even if a budget was measured.
+    # In schema 3.x `calibrated` was false during unusable hops and with a broken budget, even if a budget was
+    # measured.
     stated = state.budget is not None or any(cue.alpha is not None for cue in state.cues)
     lost = not _NO_BUDGET.isdisjoint(why_not(replaced(state, calibrated=True)))
     return judged(replaced(state, calibrated=state.calibrated or (stated and lost)))
