@@ -21,8 +21,8 @@ A port accepts one sender until that sender is silent for ten seconds, or all ho
 the file of a secret, a datagram ends in a line with its HMAC-SHA256 and has a rising "number", the "port"
 that it is for (odometry, detections or detections/NAME) and "sent_s", the Unix time of sending.
 
---save-state writes belief, site and the last numbers every minute and at the end. --resume continues from
-them, at their time or at --start.
+--save-state writes the belief, the site and the last datagram numbers every minute and at the end. --resume
+continues from them, at their time or at --start.
 
 Examples
 --------
@@ -63,7 +63,7 @@ Port = TypeVar("Port", bound="DatagramSocket[Any]")
 
 # Shortest time between two notices of lost sound.
 SAID_EVERY_NS = 1_000_000_000
-# A killed run loses what it has learned since the last save.
+# A run that is killed loses at most this much of the learned site and belief.
 SAVED_EVERY_NS = 60_000_000_000
 # Shorter secrets, in bytes, can be guessed.
 SHORTEST_KEY = 16
@@ -139,7 +139,8 @@ def _source(arguments: argparse.Namespace, sensors: "SourceSensors", sound: Path
     from worldstate.adapters.files.odometry_file import read_odometry
 
     before = None if arguments.resume is None else adapters.read_checkpoint(arguments.resume)
-    # The odometry file of a running car only shows that it moves; the motion applies to a played recording.
+    # With live sound, the odometry file of the car only shows that it moves; its motion is used for a played
+    # recording.
     car, (context, sides) = sensors.car, inputs.place_of(arguments.context)
     path = None if arguments.odometry is not None else car.odometry
     drive = None if path is None else read_odometry(path)
@@ -192,7 +193,7 @@ class _Ports:
     sockets: "list[DatagramSocket[Any]]" = field(default_factory=list)
 
     def open(self, kind: "Callable[..., Port]", address: str, *camera: str) -> "Port":
-        """Open a port, for one of several cameras with its name."""
+        """Open a port; `camera` is the name of its camera if there are several."""
         port = kind(address, self.sound.stamp_ns, self.trust, *camera)
         self.opened.enter_context(port)
         self.sockets.append(port)
@@ -360,7 +361,7 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
             saved_ns = stamp_ns
             try:
                 save()
-            except (ground.WorldstateError, OSError) as error:  # There may be room in a minute
+            except (ground.WorldstateError, OSError) as error:  # The disk may have room at the next save
                 output.say(str(error))
 
     try:
@@ -374,7 +375,7 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
 
 @contextmanager
 def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
-    """Yield a function that shows a hop in the terminal, if --view or a terminal is given."""
+    """Yield a function that shows a hop in the terminal; by default only if standard error is one."""
     if not (progress.can_draw() if arguments.view is None else arguments.view):
         yield lambda live: None
         return

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from worldstate.cli.common import inputs, output, progress
 
-_MUCH_AT_EDGE = 0.1  # Share of the hops: a source beyond the sector appears at its edge
+_MUCH_AT_EDGE = 0.1  # Share of the hops; more of them at the edge mean a source outside the sector
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

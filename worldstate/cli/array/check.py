@@ -2,8 +2,8 @@
 
 Check the microphones of a recording: dead, intermittent, noisy, exchanged, inverted or clipped channels,
 offsets, levels, wind, sound cards with a delay or a clock of their own, missing or repeated samples, and the
-sample rate. Channels are counted from 1. The sound is also compared with the positions: exchanged channels,
-another order, an array of another size.
+sample rate. Channels are counted from 1. The sound is also compared with the positions, which shows exchanged
+channels, another order or an array of another size.
 
 Sound alone cannot show that an array is mirrored or turned: give the true azimuth of one sound with
 --heard-from DEG, in degrees, left positive.

@@ -52,7 +52,7 @@ class Program:
         return next((name for n in (2, 1) if (name := " ".join(words[:n])) in self.commands), None)
 
     def members(self, group: str) -> list[str]:
-        """Return the commands of a group that are not hidden; "" is the group of commands without one."""
+        """Return the commands of a group that are not hidden; for "" those that belong to no group."""
         split = (words.rpartition(" ") for words in self.commands if words not in self.hidden)
         return [name for home, _, name in split if home == group]
 
@@ -102,7 +102,7 @@ class _Printable(logging.Formatter):
 
 
 class _New(logging.Filter):
-    """Drops a repeated line: a file that is read twice has the same faults."""
+    """Drops a repeated line, because a file that is read twice causes the same warnings twice."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a line differs from the line before."""
@@ -141,7 +141,7 @@ def check_beside(arguments: argparse.Namespace, **other_of: str) -> None:
     """
     given = vars(arguments)
     for one, other in other_of.items():
-        # A given number may be 0, such as the number of a camera.
+        # 0 counts as a given value, for example as the number of a camera.
         if given[one] not in (None, []) and (given[other] is None or given[other] is False):
             option, beside = (f"--{name.replace('_', '-')}" for name in (one, other))
             raise InvalidArgumentError(f"{option}: expected {beside} with it")
@@ -156,7 +156,7 @@ def run_program(
 ) -> int:
     """Run one command; return its exit code: 0, or 2 and one line on standard error for bad input.
 
-    `current` replaces former words of a call, `prepare` adds options to the parser of every command.
+    `current` replaces former words of a call; `prepare` adds options to the parser of every command.
     """
     if logging.lastResort is not None:  # Prints warnings if the program has set up no logging
         logging.lastResort.setFormatter(_Printable())
@@ -217,7 +217,7 @@ def _check_paths(arguments: argparse.Namespace) -> None:
     """Refuse a pipe or device in place of a file, because it may never begin or end."""
     given = (value if isinstance(value, list) else [value] for value in vars(arguments).values())
     for path in (one for values in given for one in values if isinstance(one, Path)):
-        with suppress(OSError):  # Raised again when the file is opened
+        with suppress(OSError):  # The error is raised again when the file is opened
             if path.exists() and not (path.is_file() or path.is_dir()):
                 raise InputFileError(path, "expected a file, found a device or pipe")
 

@@ -33,7 +33,7 @@ EXPORTERS = {
 }  # fmt: skip
 _EXTRAS = {"figure": "matplotlib", "camera_device": "cv2", "view": "rich", "web": "websockets"}
 _FILES = "mcap", "rerun", "osi", "autoware", "mot"
-# These exporters take messages on topics, the others take states.
+# These exporters take messages on topics; the others take states.
 _VIEWERS = "mcap", "rerun", "foxglove"
 
 
@@ -48,7 +48,7 @@ def add_output_options(parser: argparse.ArgumentParser, *, pages: bool = True) -
       autoware=FILE        Autoware's PredictedObjects, one per line
       mot=FILE             positions as MOTChallenge text of 2015, without vehicles that have none
       odas=HOST:PORT       tracks in the form of ODAS; ODAS Studio uses port 9000
-      rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3 in that storage
+      rosbag=FOLDER        advisories, objects and markers for ROS 2; rosbag-sqlite3=FOLDER uses SQLite
       NAME=TARGET          an exporter of an installed package
     """
     describe(parser, add_output_options)
@@ -114,8 +114,8 @@ def open_exports(
 ) -> Iterator[Exports]:
     """Open the targets of --export.
 
-    A recording is sent at the pace of its time stamps, and its files get their names at the end. A `live` run
-    has its own pace and no end, so that only its bags and Rerun files get their names at the end.
+    A recording is sent at the speed of its time stamps, and its files get their names at the end. In a `live`
+    run the sound sets the speed, and the files have their names from the start, except bags and Rerun files.
     """
     with ExitStack() as opened:
         exports = Exports()
@@ -182,7 +182,7 @@ def _stack(name: str, target: str, crossing_m: float, live: bool, arguments: arg
 
 @contextmanager
 def _expendable(target: str, stack: "Stack") -> "Iterator[Callable[[WorldState], object]]":
-    """Yield the function of a bag; if the bag cannot be written, a notice follows and the run continues."""
+    """Yield the function of a bag; if the bag cannot be written, print a notice and continue the run."""
     failed = False
 
     def tried(write: Callable[[], object]) -> None:

@@ -81,7 +81,8 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     """Declare --array, --car, --detections and --camera.
 
     --detections takes OVAD's JSON, COCO results (a list, or an object with "images" and "annotations"),
-    MOTChallenge text (.txt) or a folder of YOLO text. The first image is taken at the first sample.
+    MOTChallenge text (.txt) or a folder of YOLO text. The time of the first image is that of the first
+    sample.
     """
     add_array_options(parser)
     add_car_options(parser)
@@ -239,7 +240,7 @@ def search_of(arguments: argparse.Namespace) -> "adapters.ListenSettings":
 
 
 def check_boxes(arguments: argparse.Namespace, recordings: int) -> None:
-    """Refuse the boxes of one recording, by --detections or by the camera of --car, for several."""
+    """Refuse several recordings with --detections or the boxes of --car, which belong to one recording."""
     from worldstate.adapters.source import SourceSensors
 
     sensors = SourceSensors.of(None, arguments.car, arguments.camera)

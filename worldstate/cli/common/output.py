@@ -1,4 +1,4 @@
-"""Results of commands in print and in files, and the checks of files before the work."""
+"""Results of commands in print and in files, and checks of the output files before a command runs."""
 
 import argparse
 import json

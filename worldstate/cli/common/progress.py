@@ -35,7 +35,7 @@ class Bar:
         self.shown(amount)
 
     def go_on(self, stage: str, amount: float) -> None:
-        """Name the next stage, and move the bar on by the amount of the last one."""
+        """Set the name of the next stage, and advance the bar by the amount of the last stage."""
         self.stage = f": {stage}"
         self.advance(amount)
 

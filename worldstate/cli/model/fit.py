@@ -6,8 +6,8 @@ rate, band and ego motion. It holds no row of the data. A table without these is
 --array and --sample-rate state others.
 
 The classifier is a mirror-symmetric ensemble on windows relative to their site, for unseen junctions. Its
-thresholds are half-way between left-out recordings and left-out junctions. --simulated adds simulated windows
-to the training, and --streams also the classes both and direct, for a standing ego.
+thresholds are half-way between those for left-out recordings and those for left-out junctions. --simulated
+adds simulated windows to the training, and --streams also the classes both and direct, for a standing ego.
 
 Examples
 --------

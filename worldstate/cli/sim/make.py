@@ -87,7 +87,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--video-width", type=int, metavar="PX", help="width of the images (default: 1936)")
     add = parser.add_argument_group("a continuous stream").add_argument
     add("--minutes", type=float, metavar="M", help="length of the stream")
-    # No choices: the library refuses a moving ego with the reason.
+    # The option has no choices, so that the library refuses a moving ego and gives the reason.
     sites = simulation.SITES
     add("--site", help=f"{', '.join(sites)}, or TA1, MB7, ... of the other renderers (default: {sites[0]})")
     add("--traffic", choices=[*TRAFFICS], help="density of the traffic (default: calm)")

@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
     ground.in_range("--days", arguments.days, 0.0, 1e5)
     inputs.check_boxes(arguments, len(arguments.input))
-    # --out may replace the file of --known, which is read before.
+    # --out may replace the file of --known, because that file is read first.
     apart = argparse.Namespace(**{name: value for name, value in vars(arguments).items() if name != "known"})
     output.check_outputs(apart, "out", figures=("figure",))
     before = street = _known(arguments)
