@@ -161,7 +161,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if domain is not None and not uncalibrated:
             order = feature_order(domain, array, sample_rate_hz, front_end_settings)
             front_end_settings = replaced(front_end_settings, feature_order=order)
-        if model is None:  # The bearings are those of sounds that begin
+        if model is None:  # A bearing is wanted as soon as a sound begins, so rises in level are kept
             front_end_settings = replaced(front_end_settings, mask_rises=False)
         if guard is not None and guard.measures != MEASURES:
             raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
@@ -254,7 +254,7 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
             share = beside_foreign(domain, share)
-        # Uses the model's evidence alone, because bearing and looming are separate inputs of the sequence.
+        # The sequence receives the model's evidence alone, because bearing and looming are separate inputs.
         reader = self._sequence
         sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
         read = {"heard": share, "signature": signature, "bearing": bearing, "approach": approach}

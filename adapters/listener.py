@@ -1,4 +1,4 @@
-"""The whole chain: blocks of sound in, one world-state per hop out."""
+"""The whole chain, which converts blocks of sound to one world-state per hop."""
 
 import heapq
 import logging
@@ -49,7 +49,8 @@ _LOG = logging.getLogger(__name__)
 PUSHED = "pushed sound"
 # A part is half a hop.
 PARTS_PER_SECOND = 20
-# Limits of what waits for its sound: ten minutes of odometry at 100 Hz, and the boxes of the largest file.
+# Limits of the data that wait for their sound: ten minutes of odometry at 100 Hz, and the boxes of the
+# largest file.
 MOST_AHEAD, MOST_AHEAD_BYTES = 1 << 16, 64 << 20
 
 
@@ -112,7 +113,7 @@ class Senses:
 
 
 class Listener:
-    """Blocks of sound in, one world-state per hop (0.1 s) out; the length of the blocks has no effect.
+    """Convert blocks of sound of any length to world-states, one per hop (0.1 s).
 
     Parameters
     ----------
@@ -171,7 +172,7 @@ class Listener:
         else:
             source = array
         if spectra is not None:
-            # No threshold was calibrated with this front-end, so that no budget is stated.
+            # No threshold was calibrated with this front-end, so the states give no budget.
             source = replaced(source, policy=replaced(source.policy, alpha=0.0))
         self.world = source.world()
         self._source, self._rate_hz = source, sample_rate_hz
@@ -244,8 +245,9 @@ class Listener:
     def add(self, *told: Timed) -> None:
         """Add odometry, positions or measurements of other sensors; each takes effect at its own time stamp.
 
-        A measurement more than two seconds before the sound or after the next block is refused and counted.
-        So is a measurement that arrives while 65,536 wait for their sound.
+        A measurement is refused and counted if its time stamp is more than two seconds before the pushed
+        sound or, after the next block, more than two seconds ahead of it. A measurement is also refused if
+        65,536 others already wait for their sound.
         """
         for one in told:
             self._take(checked_timed("add", one).stamp_ns, one.source, partial(self._waiting.add, one))
@@ -296,9 +298,9 @@ class Listener:
     def look(self, stamp_ns: int, frame: DetectionFrame | Any, camera: str = SENSOR) -> None:
         """Add the detections of a running detector in one image.
 
-        An image more than two seconds before the sound or after the next block is refused. So are boxes
-        outside the image, and images that arrive while 65,536 images or 64 MiB wait for their sound.
-        `WorldState.delivery` counts them.
+        An image is refused if its time is more than two seconds before the pushed sound or, after the next
+        block, more than two seconds ahead of it. Boxes outside the image are refused, and so are images that
+        arrive while 65,536 images or 64 MiB wait for their sound. `WorldState.delivery` counts all of these.
 
         Parameters
         ----------
@@ -364,7 +366,8 @@ class Listener:
     def checkpoint(self) -> Checkpoint:
         """Return the state from which another listener continues at the next sample, bit for bit.
 
-        Measurements that wait for their time, at most 0.1 s of them, must be added to the other one again.
+        Measurements that still wait for their time, at most 0.1 s of them, must be added again to the other
+        listener.
 
         Examples
         --------
@@ -377,7 +380,7 @@ class Listener:
         >>> other.push(noise[50_000:]) == listener.push(noise[50_000:])
         True
         """
-        # The front-end changes in place, while the memory of a camera is replaced.
+        # The front-end is changed in place and needs a deep copy; the memory of a camera is replaced.
         eyes = {name: copy(query) for name, query in self._cameras.items()}
         senses = Senses(self._now_ns(), deepcopy(self._adapter.front_end), eyes)
         return replaced(self._learned(), senses=senses)
@@ -434,7 +437,7 @@ class Listener:
 
     def _parts(self, block: Float32Array) -> Iterator[Float32Array]:
         """Split a block so that at most one hop ends in each part."""
-        # Waiting measurements are passed on before the hops after them.
+        # Parts are this short so that waiting measurements are passed on before later hops.
         return (block[start : start + self._part] for start in range(0, len(block), self._part))
 
 
@@ -616,7 +619,7 @@ def listened(source: Source, kept: BoolArray | None = None) -> Iterator[tuple[Li
 
 
 def learn_passes(street: StreetListener | None, state: WorldState) -> None:
-    """Add the arms out of which a vehicle has just come into view to a learned street."""
+    """Add to a learned street the arms from which a vehicle has just come into view."""
     if street is None:
         return
     arms = {one.id: one.direction for one in state.entities}

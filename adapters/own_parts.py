@@ -165,7 +165,7 @@ def part_and_target(option: str, text: str) -> tuple[str, str]:
 
 
 def other_modality(name: str, path: Path) -> OtherModality:
-    """Return the reader of another sensor's file, by the package that has a reader of that name."""
+    """Return the reader of another sensor's file, from the package that has a reader of that name."""
     return partial(_checked, load_part("worldstate.measurements", name, "measurements"), path, name=name)
 
 

@@ -631,7 +631,8 @@ _SHORTEST_STEP_S, _MOST_LONGER = 5e-4, 100.0
 # Least share of the stamps within the sound, and of the sound that they cover, without a warning: for images
 # with an assumed rate, with a stated rate, and with stamps of their own, because a camera may stop earlier.
 _TOGETHER = 0.97, 0.9, 0.6
-# UTC to TAI, UTC to GPS, and GPS to TAI: offsets between clocks that were set by different sources.
+# Offsets from UTC to TAI, from UTC to GPS and from GPS to TAI, between clocks that were set by different
+# sources.
 _TIME_SCALES_S, _SAME_S = (37.0, 18.0, 19.0), 1.0
 # Usual rates of slower cameras. Images may continue after the sound for less than a second.
 _SLOW_RATES_HZ, _SAME_LENGTH, _LONGER_S = (1.0, 2.0, 2.5, 5.0, 7.5), 0.03, 1.0

@@ -151,9 +151,11 @@ def _json_lines(path: Path) -> Iterator[str]:
     left_out = 0
     with plain_file(path, "snapshots") as file:
         for number, line in enumerate(iter(partial(file.readline, MOST_CHARACTERS), b""), start=1):
-            # The last bytes of a log begin within a line, and a running log ends within one.
+            # The first line may be cut if only the end of a log was copied, and the last one while a run
+            # writes the log.
             inner = number > 1 and line.endswith((b"}\n", b"}\r\n")) and line.startswith(b"{")
-            # The decoder refuses a complete line without valid text, or one that is too long, by its number.
+            # The decoder refuses a complete line that is too long or has no valid text; its error gives the
+            # line number.
             if inner or len(line) == MOST_CHARACTERS or not _is_cut(line):
                 yield line.decode("utf-8-sig", "replace").strip()
             elif number == 1 and line.startswith(_PACKED):

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from worldstate.ground.typing import Float32Array, FloatArray
 
 Encoding = Literal["s16", "s24", "s24_32", "s32", "f32"]
-# Names of libsndfile, except for a missing one: 24 bits in the lower three of four bytes (ALSA's S24_LE).
+# The names are those of libsndfile, except for PADDED_24, which it lacks: 24 bits in the lower three of four
+# bytes (ALSA's S24_LE).
 PADDED_24 = "PCM_24_32"
 _NAMES = "PCM_16", "PCM_24", PADDED_24, "PCM_32", "FLOAT"
 SUBTYPES: dict[Encoding, str] = dict(zip(get_args(Encoding), _NAMES, strict=True))
@@ -42,7 +43,7 @@ def decoded(data: bytes, subtype: str, channels: int) -> Float32Array:
 
 
 def four_byte_form(data: bytes) -> Encoding | None:
-    """Return the obvious format of samples of four bytes each; None for all others, and for silence.
+    """Return the format of four-byte samples if it is obvious; None otherwise, and for silence.
 
     The fourth byte determines it: floats within full scale have similar exponents, 24 bits are followed by
     their sign or by zero, and 24-bit converters leave the first of four bytes empty. Samples of two or three
@@ -77,7 +78,8 @@ _FORMS = {"s16": "<i2", "s24": "", "s32 or s24_32": "<i4", "s16, big-endian": ">
 def smooth_form(data: bytes, stated: Encoding, channels: int) -> str | None:
     """Return a format in which samples are smooth while they are loud noise in the stated one, or None.
 
-    Pairs of 16-bit samples are also smooth as 32-bit numbers; the lower halves of such numbers are not.
+    Pairs of 16-bit samples also form smooth 32-bit numbers, but the lower halves of 32-bit samples are not
+    smooth.
 
     Examples
     --------

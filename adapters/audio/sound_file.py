@@ -75,7 +75,7 @@ class Audio(ABC):
         self.close()
 
     def check_channels(self, expect_channels: int | None) -> None:
-        """Refuse another number of channels than microphones."""
+        """Refuse a number of channels that differs from the number of microphones."""
         if expect_channels is not None and self.channels != expect_channels:
             expected = f"expected {expect_channels} channels, one per microphone"
             way_out = '; "channels" in the JSON file of the array selects the microphones'
@@ -83,7 +83,7 @@ class Audio(ABC):
             raise InputFileError(self.path, f"{expected}, got {self.channels}{way_out}")
 
     def check_size(self, expect_channels: int | None) -> None:
-        """Refuse another number of channels than microphones, or less than one second."""
+        """Refuse a wrong number of channels, or a recording shorter than one second."""
         self.check_channels(expect_channels)
         if self.duration_s < SHORTEST_S:
             raise InputFileError(self.path, f"expected at least 1 s of audio, got {self.duration_s:.3f} s")
@@ -412,7 +412,7 @@ SoundInput: TypeAlias = Path | tuple[Path, ...] | SoundStream | Audio
 
 
 def as_sound(given: SoundInput | str | Sequence[Path | str]) -> SoundInput:
-    """Convert strings to paths; a sequence of one path is this file."""
+    """Convert strings to paths; of a sequence with a single path, return that path."""
     if isinstance(given, Path | SoundStream | Audio):
         return given
     paths = (Path(given),) if isinstance(given, str) else tuple(map(Path, given))
@@ -486,7 +486,7 @@ class ChosenChannels(Audio):
         self.silent_channels = tuple(i for i, channel in enumerate(channels, 1) if channel in silent)
 
     def check_size(self, expect_channels: int | None) -> None:
-        """Refuse another number of channels than microphones, or less than one second."""
+        """Refuse a wrong number of channels, or a recording shorter than one second."""
         self.check_channels(expect_channels)
         self._audio.check_size(None)
 

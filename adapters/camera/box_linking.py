@@ -18,7 +18,7 @@ class AzimuthBox:
     left_rad: float
     right_rad: float
     middle_rad: float
-    height_rad: float  # Height over the depth of its near side
+    height_rad: float  # Height of the object divided by the depth of its near side
     label: str
 
 

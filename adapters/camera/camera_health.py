@@ -49,7 +49,7 @@ def strength(family: str, degradation: float) -> float:
 
 
 def darkness_of(factor: float) -> float:
-    """Return the d in [0, 1] of a factor on the brightness; 1 beyond the last level."""
+    """Return the d in [0, 1] at which the brightness has this factor; 1 beyond the last level."""
     return float(np.interp(-np.log(max(factor, 1e-6)), -np.log(STRENGTHS["darkness"]), LEVELS))
 
 

@@ -74,7 +74,7 @@ def _array(values: Any) -> FloatArray:
     return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=np.float64)
 
 
-# Name of a class, category or image; some files have numbers.
+# Name of a class, category or image; some files use numbers as names.
 Name = Annotated[str, Via(object, _name, _name)]
 
 
@@ -719,7 +719,8 @@ def _image_numbers(images: Sequence[_CocoId], *, listed: bool) -> dict[str, int]
         expected = 'expected different ids that end in a number, or "images" with such a "file_name"'
         raise InvalidArgumentError(f"{expected}, got {some:.80}")
     places = {number: place for place, number in enumerate(sorted(numbers))}
-    # A list with gaps contains some images of a video, and the numbers are those in the video, or times.
+    # A list with gaps contains only some images of a video; its numbers are those of the images in the video,
+    # or times.
     whole = len(_between(numbers)) == len(images) or max(numbers) >= MAX_FRAMES
     return {one.id: places[n] if whole else n for one, n in zip(images, numbers, strict=True)}
 
@@ -776,8 +777,8 @@ def read_yolo_text(
         with refused_as_file(file):
             lines = read_text(file, "a text file", MAX_TEXT_BYTES).splitlines()
             rows[number] = [_yolo_row(line, size_px, names) for line in lines if line.strip()]
-    # A writer of empty files, or of a data set, writes a file for every image: other images were not
-    # searched.
+    # If some files are empty, or the names are those of an exported data set, a file was written for every
+    # searched image. Images without a file were then not searched.
     if n_images is None and (not all(rows.values()) or any(_HASH.search(file.stem) for file in files)):
         first = _first(rows)
         rows = {number - first: found for number, found in rows.items()}
@@ -858,7 +859,7 @@ def _mot_row(line: str, where: str) -> tuple[int, Row]:
 def _log(
     path: Path, rows: Mapping[int, list[Row]], rate_hz: float | None, looked: Sequence[int] | int | None
 ) -> DetectionLog:
-    """Stamp the searched images: those of these numbers, the first ones, or all up to the last with a box."""
+    """Stamp the searched images: those with the given numbers, the first n, or all up to the last box."""
     count = max(rows, default=-1) + 1
     if count > MAX_FRAMES or min(rows, default=0) < 0:
         got = count - 1 if count > MAX_FRAMES else min(rows)

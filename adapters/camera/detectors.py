@@ -27,7 +27,8 @@ WIDTH_PX = 640  # Frames are reduced to this width first
 HISTORY = 100  # Number of frames in the background
 WARM_UP = 5  # First frames, which give no detections
 # Smallest difference that is motion, grey levels, Euclidean over the colours, > 0. The codec and the sensor
-# of a street camera have a noise of some 3 grey levels per colour, 5 over three: three times that.
+# of a street camera have a noise of some 3 grey levels per colour, or 5 over the three colours; the value is
+# three times the latter.
 LEAST_CONTRAST = 15.0
 MIN_AREA = 0.0015  # Smallest object as a share of the image
 MAX_AREA = 0.6  # Larger regions are changes of the light

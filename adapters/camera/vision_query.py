@@ -32,9 +32,9 @@ SENSOR = "camera"
 # Number of points for the mean miss rate over the part of the sector in view. The table is piecewise linear
 # over tens of degrees, so more points do not change the mean.
 SAMPLES = 8
-# Trackers and boxes of whole objects may reach beyond an image. The boxes are of another image size if more
-# than the first share of them is outside, or if half of them reach beyond the image and one by more than the
-# second share of the width.
+# Trackers and boxes of whole objects may reach beyond an image. The boxes belong to images of another size if
+# more than the first share of them is outside, or if half of them reach beyond the image and at least one of
+# these by more than the second share of the width.
 _MOST_OUTSIDE, _FAR_BEYOND, _FEW_BOXES = 0.1, 0.01, 4
 _FEW_PX = 2.0
 _LOG = logging.getLogger(__name__)
@@ -451,7 +451,7 @@ class SeveralCameras:
     r"""The cameras of a vehicle, combined.
 
     The sector of a sound is cut at the borders of the views. If the part P has the share s(P) of the sector
-    and is in view of the cameras c(P), all of them miss a vehicle with
+    and is in view of the cameras c(P), all of them miss a vehicle with the probability
 
     .. math:: \beta = \sum_P s(P) \prod_{i \in c(P)} \beta_i(P)
 

@@ -1,4 +1,4 @@
-"""Foxglove's server on a websocket: which viewers may connect, and how slow viewers are treated."""
+"""Foxglove's server on a websocket, with a check of the viewers' origins and a limit for slow viewers."""
 
 import io
 import logging
@@ -21,14 +21,15 @@ from .log_messages import LogMessage, LogSink
 _LOG = logging.getLogger(__name__)
 HOST = "127.0.0.1"
 MOST_VIEWERS = 8
-# Most connections of one address, and of all, without a request so far: the newest replaces the oldest. A
-# viewer sends its request at once, so connections that send a byte now and then cannot block viewers.
+# Largest number of connections without a request so far, per address and in total; the newest replaces the
+# oldest. A viewer sends its request at once, so connections that send a byte now and then cannot block
+# viewers.
 MOST_ASKING, MOST_ASKING_OF_ALL = 8, 64
-# Most messages that wait for a viewer, 3 s of hops: the newest replaces the oldest.
+# Largest number of messages that wait for a viewer, 3 s of hops; the newest replaces the oldest.
 MOST_WAITING = 100
 # A viewer that reads nothing for this time is disconnected.
 STALLED_S = 10.0
-# Longest time for the head of a request.
+# Longest time (s) and size (bytes) of the head of a request, size of a read (bytes), polling period (s).
 _HEAD_S, _HEAD_BYTES, _BLOCK_BYTES, _POLL_S = 5.0, 1 << 13, 1 << 16, 0.2
 _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
@@ -36,13 +37,19 @@ _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\
 def is_trusted(origin: str | None, named: Collection[str] = ()) -> bool:
     """Return whether a request comes from a program or a page of this machine, or from an allowed origin.
 
-    The origin of a web page has its host, that of a page in a sandbox is ``null``. Programs have no origin,
-    or one with a scheme of their own.
+    The origin of a web page contains its host; the origin of a page in a sandbox is ``null``. Programs have
+    no origin, or one with a scheme of their own.
 
-    Examples -------- >>> is_trusted(None), is_trusted("http://localhost:8080"), is_trusted("file://") (True,
-    True, True) >>> is_trusted("https://app.foxglove.dev"), is_trusted("null"),
-    is_trusted("http://localhost.evil.example") (False, False, False) >>>
-    is_trusted("https://app.foxglove.dev", ["https://app.foxglove.dev"]) True
+    Examples
+    --------
+    >>> is_trusted(None), is_trusted("http://localhost:8080"), is_trusted("file://")
+    (True, True, True)
+    >>> is_trusted("https://app.foxglove.dev"), is_trusted("null")
+    (False, False)
+    >>> is_trusted("http://localhost.evil.example")
+    False
+    >>> is_trusted("https://app.foxglove.dev", ["https://app.foxglove.dev"])
+    True
     """
     if origin is None or origin in named:
         return True
@@ -175,7 +182,7 @@ def _pass_on(source: socket.socket, target: socket.socket, stopped: threading.Ev
         while not stopped.is_set():
             try:
                 block = source.recv(_BLOCK_BYTES)
-            except TimeoutError:  # it sends nothing
+            except TimeoutError:  # the source sends nothing
                 continue
             if not block:
                 break
@@ -217,7 +224,7 @@ def live_server(
     `paced` False there is no delay, as for microphones, which set the pace themselves. A slow viewer delays
     no message: messages that it does not read are dropped. For `origins` see `OriginGate`.
     """
-    # A separate context: the global one keeps its channels for all servers of the process.
+    # A separate context is used, because the global one keeps its channels for all servers of the process.
     context = optional("foxglove").Context()
     server, host = _hidden_server(context)
     channels: dict[str, Any] = {}

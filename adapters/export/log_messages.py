@@ -34,7 +34,8 @@ from . import scene
 SNAPSHOT_TOPIC, SCENE_TOPIC = "/worldstate/snapshot", "/worldstate/scene"
 SRP_TOPIC, IMAGE_TOPIC = "/worldstate/srp", "/camera/image"
 SOUND_TOPIC, FRAME_TOPIC = "/microphones/sound", "/tf"
-# OVAD's images, 1936 pixels wide, are shown in a third of a screen: halved they take 77 kB in a log, not 245.
+# OVAD's images, 1936 pixels wide, are shown in a third of a screen. At half the width each takes 77 kB in a
+# log instead of 245 kB.
 _WIDEST_PX, _QUALITY = 1000, 80
 Told: TypeAlias = (
     WorldState | scene.SceneUpdate | scene.CompressedImage | scene.RawAudio | scene.FrameTransform
@@ -271,7 +272,7 @@ _CHUNK_BYTES = 1 << 20
 
 
 class _ChunkLimit:
-    """Size limit of a chunk, which the writer compares after every message; it drops to 0 with time."""
+    """Size limit of a chunk, which the writer checks after every message; 0 after `_CHUNK_NS`."""
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
@@ -413,7 +414,7 @@ def _compressed_bytes(chunk: bytes) -> int:
 
 
 def _decoded(chunk: bytes, claimed: int) -> bytes:
-    """Return the content of a chunk: longer than stated if it is, and nothing if it is damaged."""
+    """Return the content of a chunk, at most one byte more than the stated size; empty if it is damaged."""
     named = _CHUNK_HEAD.unpack_from(chunk)[4]
     name, rest = chunk[_CHUNK_HEAD.size :][:named], chunk[_CHUNK_HEAD.size + named :]
     data = rest[8:]

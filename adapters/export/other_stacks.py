@@ -32,7 +32,7 @@ from worldstate.state.sensor import Ego
 CROSSING_M = 9.0
 # Relative standard deviation of that distance, assumed: 6 to 12 m for two of three junctions.
 _CROSSING_SHARE = 0.3
-# Beyond this the lane would be hundreds of metres away: the place is on a circle about the ego instead.
+# At larger azimuths the lane would be hundreds of metres away, so the place is on a circle about the ego.
 _WIDEST_RAD = math.radians(80.0)
 PATH_STEP_S, PATH_STEPS = 0.5, 6
 
@@ -74,7 +74,7 @@ def lane_objects(state: WorldState, crossing_m: float = CROSSING_M) -> Iterator[
     moving = (part for one in state.entities if one.moving for part in one.on_each_side())
     for entity in moving:
         within = coming.get(entity.direction or "") if entity.status == "hidden" else None
-        # Existence times P(it comes into view | it exists): the cue states this product.
+        # The cue gives P(exists) multiplied by P(comes into view | exists).
         confidence = min(entity.existence_probability, 1.0 if within is None else within)
         if entity.position_m is None:
             pace_hz = paces.get(entity.direction or "", 0.0)
@@ -186,7 +186,7 @@ def autoware_lines(
 ) -> Iterator[Callable[[WorldState], None]]:
     """Yield a function that writes the messages of states, one per line.
 
-    The first state must have a pose, unless it `comes` later from a running odometry.
+    The first state must have a pose, unless `comes` is true: the odometry of a live run gives the pose later.
     """
     started = comes
     with line_writer(path, opener) as write:
@@ -298,7 +298,7 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
 
 
 def _set(part: Any, **values: float) -> None:
-    """Set all values of a part: a vector of OSI has three values or is absent."""
+    """Set all values of a part, because a vector of OSI has three values or is absent."""
     for name, value in values.items():
         setattr(part, name, value)
 
@@ -552,7 +552,7 @@ class LiveSender:
                 message = self._waiting.popleft()
             try:
                 self._connection.sendall(message)
-            except OSError:  # the receiver has disconnected, or has half a message
+            except OSError:  # the receiver has disconnected, or has received only part of a message
                 self.dropped += 1
                 self._connection.close()
                 if self._stopped.wait(AGAIN_S):

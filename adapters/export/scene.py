@@ -229,7 +229,8 @@ _HEIGHT_M = {"occluder": 0.0, "searched": 0.02, "cue": 0.04, "entity": 0.06}
 # Largest angle of one triangle of a sector.
 _STEP_RAD = math.radians(5.0)
 _CAR = Xyz(4.5, 1.8, 1.5)
-# The palette of the figures, by meaning; occluders are grey. Decisions are lighter, since viewers are dark.
+# Colours of the figures, by meaning; occluders are grey. Decisions have a lighter colour than in the figures,
+# because viewers have a dark background.
 _GREY = (0.5, 0.5, 0.5)
 _HIDDEN = (0.835, 0.369, 0.0)
 _IN_VIEW = (0.0, 0.447, 0.698)

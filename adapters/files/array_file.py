@@ -35,8 +35,8 @@ Axes = Literal["acoular", "base_link"]
 Row: TypeAlias = Sequence[object]
 
 MAX_BYTES = 1 << 20
-# No vehicle carries an array that is wider, or whose microphones are farther apart or closer together. Such a
-# file is in millimetres, centimetres or kilometres.
+# Limits of the width of an array and of the distances between its microphones. No vehicle carries an array
+# beyond them: such a file is in millimetres, centimetres or kilometres.
 MAX_APERTURE_M = 20.0
 MAX_SPACING_M, FAR_APART_M = 3.0, 1.0
 MIN_SPACING_M = 1e-3
@@ -297,7 +297,7 @@ def _csv_rows(path: Path, text: str) -> _Rows:
     columns, names, unit_m = _csv_columns(path, cells)
     cells = cells[unit_m is not None :]
     labels = [row[names] if names is not None and names < len(row) else "" for row in cells]
-    # A gain beside the positions is not a name, whatever its order.
+    # Labels with a decimal point are gains and not names, so the order of the lines is kept.
     order = range(len(cells)) if any("." in label for label in labels) else by_number(path, labels)
     taken: list[Row] = [[cells[at][c] if c < len(cells[at]) else None for c in columns] for at in order]
     return _Rows(taken, unit_m=unit_m or 1.0)
@@ -325,7 +325,7 @@ def _csv_columns(path: Path, cells: list[list[str]]) -> tuple[list[int], int | N
 
 
 def _numbered(path: Path, cells: list[list[str]]) -> tuple[list[int], int, None]:
-    """Return the columns of four-number lines if either the first or the last numbers the microphones."""
+    """Return the columns of lines with four numbers, if the first or the last one counts the microphones."""
     counted = [{row[i] for row in cells if len(row) == 4 and row[i].isdecimal()} for i in (0, 3)]
     counts = [i for i, found in zip((0, 3), counted, strict=True) if len(found) == len(cells)]
     if len(counts) == 1:

@@ -106,7 +106,7 @@ def by_number(path: Path, names: Sequence[str]) -> list[int]:
     ranked = sorted(given, key=numbers.__getitem__)
     if len(texts) > 1 or len({*numbers}) < len(names) or ranked == given:
         return given
-    # Locales may ignore punctuation: mic_10.wav before mic_1.wav.
+    # Some locales ignore punctuation and sort mic_10.wav before mic_1.wav.
     bare = [re.sub(r"[\W_]", "", name) for name in small]
     by_text = any(sorted(one) == one for one in (list(names), small, bare))
     done = "taken in that of the numbers" if by_text else "kept as they were given"

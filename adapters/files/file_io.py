@@ -187,7 +187,7 @@ class GrowingFile:
             self._lose(str(error))
 
     def _make_way(self) -> None:
-        """Rename this file to the name of the previous one, unless that is missing or of another run."""
+        """Rename this file to the name of the previous full file of this run, or to a free name."""
         here, before = os.fstat(self._file.fileno()), self._aside
         ours = before and before[0].exists() and os.path.samestat(before[0].stat(), before[1])
         target = check_target(self.path)
@@ -478,7 +478,7 @@ def _places(
 
 
 def in_order(stamps_ns: Sequence[int], source: str) -> list[int]:
-    """Return the positions of the sorted stamps, only the last one of equal stamps; warn of any change.
+    """Return the indices that sort the stamps, with the last one of equal stamps; warn of any change.
 
     Examples
     --------

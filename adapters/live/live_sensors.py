@@ -60,11 +60,11 @@ _KERNEL_BYTES = 1 << 22
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Whose datagrams a port accepts; without addresses and key, only those of the first sender."""
+    """The senders whose datagrams a port accepts; without addresses and key, only the first sender."""
 
     allow: tuple[str, ...] = ()
     key: bytes | None = field(default=None, repr=False)
-    numbers: Mapping[str, int] = field(default_factory=dict)  # Last accepted per port before this run
+    numbers: Mapping[str, int] = field(default_factory=dict)  # Last accepted number per port before this run
 
 
 def signed(record: Mapping[str, object], key: bytes, port: str) -> bytes:
@@ -420,7 +420,7 @@ class CameraFeed(ReaderThread):
     device : int
         Number of the camera in OpenCV.
     images : StampedImages
-        Channel for the images. If the camera gives none, it is tried again until the end.
+        Channel for the images. If the camera gives no image, reading is tried again until the end.
 
     Raises
     ------

@@ -121,20 +121,20 @@ class BoundedChannel(Generic[T]):
             raise self._error
 
 
-# Blocks per second of a source. The state of a hop that ends within a block waits for its end: at most 25 ms,
-# and not at all if hops are whole blocks, as at 48 kHz.
+# Blocks per second of a source. The state of a hop that ends within a block waits for the end of the block:
+# at most 25 ms, and not at all if hops are whole blocks, as at 48 kHz.
 BLOCKS_PER_SECOND = 40
 # Largest waiting time of sound. A short stall of the process is made up for; sound that waits longer is
 # dropped, because a later state is no warning.
 LONGEST_WAIT_S = 2.0
 # Lost sound of up to this duration, plus at most one hop, is replaced by silence. The snapshot then reports
 # lost samples, but not yet dead microphones. Silence takes as long to process as sound, so a slow computer
-# would fall behind by all it loses. The rest of a longer gap is left out together with all waiting blocks, so
-# that the sound after it is continuous.
+# could not catch up if all lost sound were replaced. The rest of a longer gap is left out together with all
+# waiting blocks, so that the sound after it is continuous.
 HEARD_SILENCE_S = 0.9
 # A longer gap is no loss; the device was asleep.
 LONGEST_GAP_S = 60.0
-# After this time without data a device has stalled; with one hop more, the state is published within 1 s.
+# A device without data for this time has stalled. The state follows within 1 s, one more hop included.
 STALL_S = 0.5
 # Relative to full scale. A converter gives at most 1, and single precision sums squares up to this without
 # overflow.
@@ -246,7 +246,7 @@ class LiveSound(Audio):
         return self.lost_samples / self.sample_rate_hz
 
     def check_size(self, expect_channels: int | None) -> None:
-        """Refuse another number of channels than microphones; the length is not known."""
+        """Refuse a wrong number of channels; the length is not known."""
         self.check_channels(expect_channels)
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
@@ -397,7 +397,7 @@ def kept_sound(
         yield write
 
 
-# A lateness above this share of a block means lost samples, below it jitter of the callback.
+# A delay above this share of a block means lost samples; a smaller one is jitter of the callback.
 _LOST_SHARE = 0.5
 
 
@@ -442,7 +442,7 @@ class PortAudioInput:
     MissingExtraError, MissingPortAudioError
         If sounddevice or PortAudio is not installed.
     InvalidArgumentError
-        If there is no such device, or it has too few channels or not this sample rate.
+        If there is no such device, it has too few channels, or it does not support this sample rate.
     """
 
     def __init__(self, channels: int, sample_rate_hz: int, device: int | str | None = None) -> None:

@@ -61,7 +61,7 @@ class BagReader:
     """An open bag."""
 
     path: Path
-    reader: Any  # rosbags' own
+    reader: Any  # The reader of rosbags
 
     def count(self, topic: str) -> int:
         """Return the number of messages on a topic, from the bag's metadata."""
@@ -202,7 +202,7 @@ class AudioPacket:
 
 @dataclass(frozen=True, slots=True)
 class BagSound(sound_file.SoundStream):
-    """A sound topic of a bag. The samples are the clock, starting at the stamp of the first sample."""
+    """A sound topic of a bag. Its clock counts the samples, starting at the stamp of the first one."""
 
     path: Path
     topic: str
@@ -541,8 +541,8 @@ def _timed(
 ) -> tuple[list[int], list[T]]:
     """Return increasing times on the clock of the sound, and the contents of the messages.
 
-    If more than three in four stamps repeat an earlier one, as of a node that sends its start time, they are
-    ignored. The time of recording then replaces them, as for messages without a stamp.
+    If more than three in four stamps repeat an earlier one, for example because a node always sends its start
+    time, they are ignored. The time of recording then replaces them, as for messages without a stamp.
     """
     told = [(stamp_of(one.header), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)]
     stamped = [stamp_ns for stamp_ns, *_ in told if stamp_ns]

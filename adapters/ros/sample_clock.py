@@ -6,13 +6,13 @@ from worldstate.ground.typing import FloatArray, IntArray
 
 # A delay that later messages recover within this time is jitter, a burst or a stall of the recorder.
 CATCH_UP_NS = 30_000_000_000
-# After the last messages nothing follows that could recover a delay, so losses there are unknown.
+# No messages after the last ones could show that a delay is recovered, so losses there are unknown.
 _LEAST_AFTER_NS = 500_000_000
 # Number of messages with which a delay is compared, its minimum, and the share of early stamps that is
 # ignored.
 _BEFORE, _LEAST_BEFORE, _EARLY = 200, 3, 0.1
-# This many later messages show the least delay reliably; with fewer, all must be later than any message
-# before.
+# A loss is found if the least delay of the later messages exceeds the median of the earlier delays. With
+# fewer later messages than this, it must exceed the largest of them.
 _FEW_AFTER = 50
 # If stamps go back by more than this for so many messages, they start again, as of a bag played in a loop.
 _AGAIN_NS, _AGAIN = 2_000_000_000, 5
