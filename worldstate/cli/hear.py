@@ -10,7 +10,7 @@ site, detections and odometry. Otherwise the first folder of a path below CORPUS
 
 DIR receives the folders recordings, approaches and hours with one Parquet file per recording. The name of a
 file follows from the content, the array, the model, the options and the version. A recording that cannot be
-read is a row of recordings with its failure. One call reads all files of a table, for example
+read has a row with the failure in recordings. One call reads all files of a table, for example
 pandas.read_parquet("DIR/approaches").
 
 --cascade uses four microphones first, and all of them only around seconds with unusual level or coherence.

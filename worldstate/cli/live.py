@@ -3,10 +3,9 @@
 Compute the world-state from the microphones of this machine, or from a recording that is played back.
 
 The sound is not stored without --keep-sound, because microphones in public record people. If the machine is
-too slow, the lost sound is an overrun and is replaced by silence. Ctrl-C ends the run with complete files.
-Logs and sound can be read while they grow; after a kill half a second is missing. An earlier file of the same
-name becomes NAME.N.SUFFIX. If a log cannot be written, a notice on standard error follows and the run
-continues.
+too slow, sound is lost (an overrun) and replaced by silence. Ctrl-C ends the run with complete files. Logs
+and sound can be read while they grow; after a kill half a second is missing. An earlier file of the same name
+becomes NAME.N.SUFFIX. If a log cannot be written, a notice on standard error follows and the run continues.
 
 --detections HOST:PORT receives the detections of your own detector, one UDP datagram per image:
   {"boxes": [[x1, y1, x2, y2], ...], "scores": [...], "classes_str": [...], "age_s": 0.04}

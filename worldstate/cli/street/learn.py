@@ -7,8 +7,8 @@ per side. The ego must stand.
 INPUT is a recording with boxes of a camera, as for `worldstate street label`. --known continues from an
 earlier file. `worldstate run --context` takes the file of --out.
 
-An edge that vehicles no longer come out of is learned again after two or three vehicles. Older passes lose
-their weight slowly.
+If vehicles no longer come out from behind an edge, it is learned again after two or three vehicles. Older
+passes lose their weight slowly.
 
 Examples
 --------
