@@ -628,8 +628,9 @@ _ONE_DAY_S = 86_400.0
 # Closer time stamps have another unit, and so have stamps that begin with the sound and last this many times
 # longer.
 _SHORTEST_STEP_S, _MOST_LONGER = 5e-4, 100.0
-# Least share of the stamps within the sound, and of the sound that they cover, without a warning: for images
-# with an assumed rate, with a stated rate, and with stamps of their own, because a camera may stop earlier.
+# Without a warning at least this share of the stamps is within the sound, and they cover at least this share
+# of it: for images with an assumed rate, with a stated rate, and with stamps of their own, because a camera
+# may stop earlier.
 _TOGETHER = 0.97, 0.9, 0.6
 # Offsets from UTC to TAI, from UTC to GPS and from GPS to TAI, between clocks that were set by different
 # sources.

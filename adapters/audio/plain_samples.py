@@ -76,7 +76,7 @@ _FORMS = {"s16": "<i2", "s24": "", "s32 or s24_32": "<i4", "s16, big-endian": ">
 
 
 def smooth_form(data: bytes, stated: Encoding, channels: int) -> str | None:
-    """Return a format in which samples are smooth while they are loud noise in the stated one, or None.
+    """If samples are loud noise in the stated format, return a format in which they are smooth, or None.
 
     Pairs of 16-bit samples also form smooth 32-bit numbers, but the lower halves of 32-bit samples are not
     smooth.
@@ -190,7 +190,7 @@ def plain_samples(path: Path) -> PlainSamples | None:
 
 
 def _chunks(file: BinaryIO, form: _Form, at: int | None = None) -> Iterator[tuple[bytes, int, int]]:
-    """Yield name, size and first byte of each chunk, the file at that byte; the last may be truncated."""
+    """Yield name, size and first byte of each chunk, and move the file there; the last may be truncated."""
     at, end = form.first if at is None else at, os.fstat(file.fileno()).st_size
     for _ in range(MAX_CHUNKS):
         file.seek(min(at, end))

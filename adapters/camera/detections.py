@@ -347,7 +347,7 @@ class DetectionLog:
         return None if index < 0 or stamp_ns - int(self.stamps_ns[index]) > max_age_ns else index
 
     def left_out(self, frame: int, keep: DetectionFilter) -> IntArray:
-        """Return the indices of the moving boxes of an image that are not used; a score of 0 is no box.
+        """Return the indices of the moving boxes of an image that are unused; score 0 does not count.
 
         Examples
         --------

@@ -253,7 +253,7 @@ def mcap_file(path: Path, opener: FileOpener = whole_file) -> Iterator[LogSink]:
 
         def write(message: LogMessage) -> None:
             nonlocal messages
-            # The scene of a state follows it.
+            # A new file begins with a snapshot, because the scene of a state follows its snapshot.
             if isinstance(file, GrowingFile) and file.full and message.topic == SNAPSHOT_TOPIC:
                 messages.finish()
                 file.begin()
@@ -323,7 +323,8 @@ def read_messages(path: Path, *topics: str) -> Iterator[tuple[int, str, str]]:
     with plain_file(path, "an MCAP file") as file:
         found = False
         try:
-            # By time of writing and not by stamp: a late measurement may have moved a stamp back.
+            # The order is that of writing and not of the stamps, because a late measurement may have moved a
+            # stamp back.
             messages = reader(file, validate_crcs=True, record_size_limit=_LARGEST_RECORD)
             for _, channel, message in messages.iter_messages(log_time_order=False):
                 found = True
