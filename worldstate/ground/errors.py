@@ -59,7 +59,8 @@ class InputFileError(WorldstateError):
         self.problem = problem
 
     def __reduce__(self) -> tuple[type, tuple[object, str]]:
-        # Pickle would call the class with the one text that it made, which breaks the pool of processes.
+        # Pickle would call the class with the message alone, which would fail and break the pool of
+        # processes.
         return type(self), (self.path, self.problem)
 
 

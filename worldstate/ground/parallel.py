@@ -91,8 +91,8 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
-        # Between two items the pool takes the signal for an error of the last item and waits for the next
-        # one, which never comes: in one of some twenty runs a worker stayed.
+        # If the signal arrives between two items, the pool treats it as an error of the last item and waits
+        # for a next item, which never comes: in about one of twenty runs a worker did not end.
         time.sleep(GRACE_S)
         os._exit(128 + signal.SIGTERM)
 
@@ -122,7 +122,8 @@ def _handled(handler: Callable[[int, object], object] | signal.Handlers, *number
 @contextmanager
 def deferred_signals() -> Iterator[None]:
     """Delay SIGINT and SIGTERM until all files that belong together are written."""
-    # A blocked signal would reach another thread of the process; its handler runs in the main thread anyway.
+    # Signals are not blocked, because a blocked one would reach another thread of the process, and its
+    # handler runs in the main thread anyway.
     arrived: list[int] = []
     try:
         with _handled(lambda number, _: arrived.append(number), signal.SIGINT, signal.SIGTERM):

@@ -27,7 +27,8 @@ Plan: TypeAlias = tuple[Write, Read]
 
 MOST_CHARACTERS = 64 << 20
 _HALF = re.compile("[\ud800-\udfff]")
-# A list of two characters takes 80 bytes when decoded, so the number of values limits the memory.
+# An empty list has two characters but takes 80 bytes when decoded, so memory is limited by the number of
+# values.
 MOST_VALUES = 4_000_000
 MOST_ITEMS = 1_000_000
 _WORD = 1 << 63  # Larger than all integers of 64 bits
@@ -273,7 +274,8 @@ def _refuse_constant(name: str) -> float:
 
 
 _BLANKS, _DECODER = (" ", "\t", "\n", "\r"), json.JSONDecoder(parse_constant=_refuse_constant)
-_WINDOWS = 1 << 11, 1 << 15, 1 << 22  # For an item of a list: most are short, an image of 1,000 boxes is not
+# Characters decoded per list item: most are short, an image of 1,000 boxes is not
+_WINDOWS = 1 << 11, 1 << 15, 1 << 22
 
 
 @cache
@@ -494,8 +496,8 @@ def _array(scalar: type) -> Read:
         if not isinstance(data, list | tuple):
             return leaf(data)
         items = _items(data)
-        # The shipped model has 640,000 numbers, an image up to 4,000; checks one by one would take most of
-        # the time.
+        # The shipped model has 640,000 numbers and an image up to 4,000: checking each number alone would
+        # take most of the time.
         rows = {list, tuple} >= set(map(type, items)) > set() and max(map(len, items)) <= MOST_ITEMS
         numbers = list(itertools.chain.from_iterable(items)) if rows else items
         kinds = set(map(type, numbers))

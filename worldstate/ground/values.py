@@ -21,7 +21,7 @@ RealT = TypeVar("RealT", float, FloatArray)
 # Last answer of a co-evidence channel about an entity: found, searched for and not found, not searched for.
 Answer: TypeAlias = Literal["visible", "absent", "unqueried"]
 
-# Below this share of noticed vehicles a hop is not used as evidence.
+# If a smaller share of hidden vehicles would be noticed, the hop is not used as evidence.
 LEAST_HEARD = 0.2
 
 # Keeps logarithms and quotients finite if a probability or a share is zero.

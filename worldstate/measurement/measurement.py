@@ -25,7 +25,7 @@ _SIGHTING = {
     "width_rad": (0.0, math.tau),
     "moving": bool,
 }
-MOST_LOOKS = 32  # Number of cameras of a car
+MOST_LOOKS = 32  # Maximum number of cameras of a car
 _MOST_SIGHTINGS = 100_000  # The filter uses at most 64 of them
 
 
@@ -134,7 +134,7 @@ class Heard:
 
     @property
     def usable(self) -> bool:
-        """Whether the hop is used as evidence; below a fifth, silence has no meaning."""
+        """Whether the hop is used as evidence; if the share is below 0.2, silence has no meaning."""
         return self.share >= LEAST_HEARD
 
     def __post_init__(self) -> None:
@@ -326,7 +326,7 @@ class Measurement:
     ('v2x', 'not measured')
     """
 
-    # Written without a kind, like checkpoints from before scans of positions existed.
+    # Written without a kind, as in checkpoints that are older than position scans.
     LAYOUT: ClassVar = Layout()
 
     stamp_ns: int

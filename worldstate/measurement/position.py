@@ -9,8 +9,8 @@ from worldstate.abduction.road_users import ClassShares, class_shares
 from worldstate.ground import InvalidArgumentError, finite_array, in_range, integer_ns, named, nanoseconds
 from worldstate.ground.checks import all_of, check_fields, pair
 
-# Limits of accepted values: farther objects have no effect within the horizons of the filter. Outside these
-# variances a covariance is singular to rounding or contains no information.
+# Limits of accepted values: farther objects have no effect within the horizons of the filter. A covariance
+# with variances outside these limits is singular after rounding or contains no information.
 _FARTHEST_M, _FASTEST_MPS = 1e4, 200.0
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-6, 1e6
 # A scan is associated as a whole, and the time for this grows with the cube of its size.

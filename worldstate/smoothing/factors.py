@@ -117,8 +117,8 @@ def motion_noise(settings: SmoothingSettings, step_s: float) -> NoiseModel:
     plain = gtsam.noiseModel.Gaussian.Covariance(settings.acceleration_psd * unit)
     if settings.manoeuvre_k is None:
         return plain
-    # A redescending loss fits a mixture of constant pace and manoeuvres: hidden positions are off by 1.54 m.
-    # With Huber's loss, which grows linearly, it is 1.85 m.
+    # A redescending loss fits a mixture of constant pace and manoeuvres: the error of hidden positions is
+    # 1.54 m. With Huber's loss, which grows linearly, it is 1.85 m.
     loss = gtsam.noiseModel.mEstimator.Cauchy.Create(settings.manoeuvre_k)
     return gtsam.noiseModel.Robust.Create(loss, plain)
 
@@ -128,8 +128,8 @@ def motion_factor(before: Node, after: Node, step_s: float, noise: NoiseModel) -
 
     .. math:: e = c(x_{k+1}) - F\, c(x_k), \quad e \sim N(0, q\,Q(dt))
     """
-    # In polar coordinates the noise is q / r^2 with a guessed range: hidden positions were off by 1.28 m (now
-    # 1.10 m), and their normalised squared error was 7.3 (now 3.7, ideal 4).
+    # In polar coordinates the noise would be q / r^2 with a guessed range: the error of hidden positions was
+    # 1.28 m (now 1.10 m), and their normalised squared error was 7.3 (now 3.7, ideal 4).
     flow = _flow(step_s)
 
     def error(x: FloatArray, y: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
@@ -147,7 +147,7 @@ def _flow(step_s: float) -> FloatArray:
 
 def bearing_factor(node: Node, one: Bearing, settings: SmoothingSettings) -> Factor:
     """Return the factor of a measured azimuth."""
-    # Of the equivalent angles, the one nearest to the estimate.
+    # The equivalent angle nearest to the estimate is used.
     near = node.state[0] + wrap_angle(one.azimuth_rad - float(node.state[0]))
     return _scalar(node, (0, near), azimuth, one.azimuth_rad, one.std_rad, settings, angle=True)
 
@@ -159,7 +159,8 @@ def approach_factor(node: Node, one: Approach, settings: SmoothingSettings) -> F
 
 def range_factor(node: Node, one: Range, settings: SmoothingSettings) -> Factor:
     """Return the factor of a measured distance, as its logarithm, which is a component of the state."""
-    # With exp(log r), a precise range on a wide prior moved the visible phase by 1.7 m (now 0.35 m).
+    # As a factor of exp(log r), a precise range with a wide prior moved positions in view by 1.7 m (now 0.35
+    # m).
     value = math.log(one.range_m)
     return _scalar(node, (3, value), log_range, value, one.std_m / one.range_m, settings)
 

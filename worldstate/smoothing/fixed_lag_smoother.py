@@ -32,8 +32,8 @@ def _parameters() -> Any:
     import gtsam
 
     parameters = gtsam.ISAM2Params()
-    # Without this, every factor that was ever marginalised keeps its slot: 4432 slots after 1500 steps, not
-    # 44.
+    # Without this, every factor that was ever marginalised keeps its slot: 4432 slots instead of 44 after
+    # 1500 steps.
     parameters.findUnusedFactorSlots = True
     # Cholesky squares the matrix, which makes an unmeasured range indeterminate.
     parameters.setFactorization("QR")
@@ -73,8 +73,8 @@ class FactorGraph:
             values.insert(key, value)
         self._updates += 1
         self._smoother.update(graph, values, self.times)
-        # One estimate takes as long as all of them: a quarter of an update. Until the next relinearisation,
-        # the initial values of variables are a good enough start for the next ones.
+        # Computing one estimate takes as long as computing all: a quarter of an update. Until the next
+        # relinearisation, the initial values of variables are accurate enough to start the next ones.
         self._near = {} if self._updates % self._every == 0 else self._near | self._values
         self._clear()
 
@@ -264,8 +264,8 @@ class FixedLagSmoother:
             self._origin_ns = self._now_ns = stamp_ns
 
     def _time_s(self, stamp_ns: int) -> float:
-        # In whole seconds, so that the states of one second are marginalised together. One by one, every step
-        # would eliminate the whole lag again.
+        # Times are whole seconds, so that the states of one second are marginalised together. If they were
+        # marginalised one by one, every step would eliminate the whole lag again.
         return float((stamp_ns - (self._origin_ns or 0)) // _BLOCK_NS)
 
     @property
@@ -360,7 +360,7 @@ class FixedLagSmoother:
                 del self._entities[name]
 
 
-# m^2/s^3. Hidden positions of 259 simulated passes are off by 1.87 m; with robust losses it is 1.34 m.
+# m^2/s^3. The error of hidden positions in 259 simulated passes is 1.87 m; with robust losses it is 1.34 m.
 _ACCELERATION_PSD = 1.0
 
 

@@ -87,10 +87,10 @@ class Moments:
 # On simulated streams one pass in twenty begins elsewhere: a bicycle whose first boxes were missed, or two
 # vehicles tracked as one.
 _STRAY = 0.05
-# A single pass adds at most -log(0.05) = 3 nats, so it takes at least two strange passes in a row.
+# A single pass adds at most -log(0.05) = 3 nats, so at least two unusual passes in a row are needed.
 _THRESHOLD = 5.0
 # First boxes at one simulated corner are within 0.2 degrees of one another. With real bodies of different
-# heights, and other misses, they are farther apart; the passes themselves determine how far.
+# heights, and other misses, they are farther apart; this spread is learned from the passes.
 _SPREAD_RAD = math.radians(0.5)
 _KNOWN = 1.5  # Number of passes that make an edge known
 _USUAL = blind_corner("left", 1)
@@ -146,8 +146,8 @@ class LearnedEdge:
         surprise = max(0.0, self.surprise + _UNIFORM - either) if met else 0.0
         since = self.since.plus(azimuth_rad) if surprise > 0.0 else Moments()
         if surprise > _THRESHOLD:
-            # If two passes contradict a single earlier one, the earlier one was the stray: the place has not
-            # changed.
+            # If two passes contradict a single earlier one, the earlier one was the outlier: the place has
+            # not changed.
             return LearnedEdge(since, changes=self.changes + (self.moments.weight >= _KNOWN))
         moments = self.moments.plus(azimuth_rad, math.exp(expected - either))
         return LearnedEdge(moments, surprise, since, self.changes)
@@ -198,7 +198,8 @@ class LearnedArm:
     @property
     def rate_hz(self) -> float:
         """Expected arrivals per second; a Gamma prior around the usual rate is worth one arrival."""
-        # One minute of observation outweighs this prior: streets differ by a factor of three either way.
+        # One minute of observation outweighs this prior, because the rates of streets differ from it by a
+        # factor of three in either direction.
         usual_hz = Rates().arrival_hz
         return usual_hz * (1.0 + self.arrivals) / (1.0 + usual_hz * self.exposure_s)
 

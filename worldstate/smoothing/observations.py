@@ -18,7 +18,8 @@ from worldstate.measurement import Approach, Bearing, Position
 
 # No entity comes closer to the ego vehicle than this; at 0 bearings have no derivative.
 _NEAREST_SQUARE_M2 = 0.25
-# exp overflows if contradictory approach rates drive log r, which is not measured.
+# Without this limit, contradictory approach rates could raise log r, which is not measured, until exp
+# overflows.
 _FARTHEST_LOG_M = math.log(1e4)
 
 
@@ -252,7 +253,8 @@ class SmoothedTrack:
         (0.5, 0.1)
         """
         beyond = side * wrap_angle(self.motion.mean[:, AZIMUTH] - edge_rad)
-        # Behind the ego vehicle, azimuths beyond the edge continue at the other end of the turn.
+        # Azimuths wrap behind the ego vehicle: a decrease by half a turn or more is not a passage of the
+        # edge.
         ahead = beyond[:-1] - beyond[1:] < math.pi
         crossed = np.flatnonzero((beyond[:-1] > 0.0) & (beyond[1:] <= 0.0) & ahead)
         if not crossed.size:

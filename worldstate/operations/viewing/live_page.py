@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 HOST, STATES = "127.0.0.1", "/states"
-# One minute of hops: a page that is opened later shows them at once, and a slow page may be late by as much.
+# One minute of hops: a page that is opened later shows them at once, and a slow page may lag by up to a
+# minute.
 MOST_ROWS = 600
 MOST_VIEWERS = 8
 # Longest time that a viewer may take for its request, for the reply to a ping, and for closing.
@@ -34,8 +35,8 @@ _MOST_BYTES = 1024
 class LivePage:
     """Serve the page of a live run, and send each open page the hops as they arrive.
 
-    Only its own pages and programs of this machine receive states. A browser lets any web page connect to a
-    port of the same machine, but its request contains the origin of the page.
+    Only the pages that it serves, and programs on this machine, receive states. A browser lets any web page
+    connect to a port of the same machine, but the request contains the origin of that page, which is checked.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def write_log_page(path: Path, data: PageData) -> None:
 def page_html(data: PageData, live: str = "") -> str:
     """Return the page; `live` is a script that may connect to the server of the page only."""
     template = (files("worldstate") / "data" / "log_view.html").read_text("utf-8")
-    # Within a script element only "<" can end it or begin a comment.
+    # Inside a script element, only "<" can begin its end tag or a comment.
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     page = template.replace("@connect@", "connect-src 'self'; " if live else "").replace("@live@", live)
     return page.replace("@data@", text)
@@ -217,7 +217,7 @@ class _Sound:
             return
         samples, step = self.samples, -(-self.rate_hz // HIGHEST_RATE_HZ)
         if step > 1:
-            from scipy import signal  # Imported here: it takes 1 s, and a page without sound needs none
+            from scipy import signal  # Imported here: it takes 1 s, and a page without sound does not need it
 
             resampled = signal.resample_poly(samples.astype(float), 1, step)
             samples = np.clip(np.rint(resampled), -32768, 32767).astype(np.int16)
@@ -278,10 +278,10 @@ def _hidden(cue: RiskCue) -> str:
 
 
 def is_reflected(state: WorldState) -> bool:
-    """Return whether the loudest sound is likely a reflection, or is bent round a corner.
+    """Return whether the loudest sound is probably reflected, or diffracted around a corner.
 
-    It is while a vehicle is likely hidden, unless a vehicle in view is within 10 degrees of the sound: the
-    sound of a hidden vehicle has no straight path to the array.
+    This holds while a vehicle is probably hidden, unless a vehicle in view is within 10 degrees of the sound:
+    the sound of a hidden vehicle has no straight path to the array.
 
     Examples
     --------

@@ -72,14 +72,15 @@ def sound_power(
         on_second()
     rows += [(seconds(one.stamp_ns), one.srp.astype(np.float32)) for one in front_end.finish()]
     ends_s, times_s = np.array([end_s for end_s, _ in rows]), _times(states)
-    # With --start, or from a bag, samples do not give the clock of the states: align the first hops.
+    # With --start, or for a bag, times counted in samples differ from the clock of the states: the first hops
+    # are aligned.
     if times_s[-1] > ends_s[-1]:
         ends_s += times_s[0] - ends_s[0]
     return _power(ends_s.tolist(), front_end.settings.azimuths_rad(), [row for _, row in rows])
 
 
 def _power(ends_s: Sequence[float], azimuths_rad: FloatArray, rows: Sequence[Float32Array]) -> SoundPower:
-    # A window of 1 s that is drawn at its end lags the camera by 0.5 s; it is drawn at its middle.
+    # A window of 1 s is drawn at its middle, because at its end it would lag the camera by 0.5 s.
     return SoundPower(np.array(ends_s) - 0.5 * _WINDOW_S, azimuths_rad, np.array(rows))
 
 
