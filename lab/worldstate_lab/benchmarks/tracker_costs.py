@@ -102,8 +102,8 @@ def _detected(found: Iterable[Bearing | Sighting], when: datetime) -> tuple[Any,
 class GmPhd:
     """The Gaussian-mixture PHD filter: azimuths of the components with a weight above one half.
 
-    Vehicles are born anywhere ahead or, if the ends of the view are given, there, where they come into view
-    (J. Menezes and M. Campbell, arXiv 2605.20666, without its semantic part).
+    New vehicles appear anywhere ahead or, if the ends of the view are given, at these ends (J. Menezes and M.
+    Campbell, arXiv 2605.20666, without its semantic part).
     """
 
     def __init__(self, ends_rad: Sequence[float] = ()) -> None:
@@ -211,7 +211,7 @@ def tracker_times(rng: np.random.Generator) -> dict[str, Milliseconds]:
 def hops(n: int, rng: np.random.Generator) -> list[Measurement]:
     """Return hops in which a camera detects the same n vehicles, side by side."""
     stand = np.linspace(-0.5, 0.5, n) if n > 1 else np.zeros(1)
-    # The vehicles are as far apart as the standard deviations of their boxes permit.
+    # The deviation falls with the number of vehicles, so that neighbouring boxes remain distinguishable.
     std = min(0.02, 0.2 / n)
     azimuth_rad = stand + rng.normal(0.0, 0.25 * std, (HOPS, n))
     return [

@@ -103,10 +103,11 @@ def hazard_awareness(
 ) -> Awareness:
     """Evaluate every condition with the same thresholds.
 
-    Both thresholds are set on hazard-free hops of other recordings: gamma(alpha) of the advisory's statistic
-    on the clean recordings, because the statistic only falls if absence is weaker evidence; and that of
-    P(hidden) + P(visible) without a camera, because it only rises then. The statistic uses `prior` and must
-    be above its threshold for `sustain_hops`. `draws` (draws, recordings) lists the recordings of each draw.
+    Both thresholds are set on hazard-free hops of other recordings. The threshold gamma(alpha) of the
+    advisory's statistic is set on the clean recordings, because the statistic can only fall if absence is
+    weaker evidence. That of P(hidden) + P(visible) is set without a camera, because this sum can only rise
+    then. The statistic uses `prior` and must be above its threshold for `sustain_hops`. `draws` (draws,
+    recordings) lists the recordings of each draw.
     """
     clean = [one[CLEAN] for one in recordings]
     if not any(one.after_sight().any() for one in clean):
@@ -154,7 +155,7 @@ class _Judged:
 
 
 class _Counts:
-    """Hops after T0 of every recording, with the detected and the aware ones; gives shares for any draw."""
+    """Numbers of all, detected and aware hops after T0 of every recording; gives shares for any draw."""
 
     def __init__(self, judged: Sequence[_Judged], draws: IndexArray) -> None:
         flags = [(one.in_sight(one.recording.found), one.in_sight(one.aware)) for one in judged]

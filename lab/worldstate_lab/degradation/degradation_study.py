@@ -102,7 +102,7 @@ def _evenly(recordings: Sequence[Recording], number: int) -> list[Recording]:
     ranked = []
     for place, one in enumerate(recordings):
         stratum = (one.environment, one.label)
-        # Side before junction, so that a remainder is spread over as many junctions as possible.
+        # Sides are taken before junctions, so that a remainder is spread over as many junctions as possible.
         ranked.append((taken[stratum], one.label or "", place))
         taken[stratum] += 1
     return [recordings[place] for place in sorted(place for *_, place in sorted(ranked)[:number])]
@@ -293,7 +293,7 @@ def degradation_study(
     rates = {fold: passes.rates(folds != fold, seen, counts) for fold in set(folds.tolist())}
     items = [replace(one, rates=rates[fold]) for one, fold in zip(seen, folds.tolist(), strict=True)]
     believed = _done(over, passes.filter, items, skipped)
-    # Strata by kind only: each junction and side has one or two recordings, which would hardly vary.
+    # Strata by kind only: each junction and side has one or two recordings, whose draws would hardly vary.
     draws = stratified_draws([one.hazard_free for one in believed], rng)
     policy = read_model(chosen.model).policies.policies[0]
     left = {str(one) for one in believed}
@@ -314,7 +314,7 @@ def degradation_study(
 
 @dataclass(frozen=True, slots=True)
 class SweepItem:
-    """One recording with the results of the passes so far; as text, its name."""
+    """One recording with the results of the passes so far; its text form is its name."""
 
     recording: Recording
     tables: Tables = field(default_factory=dict)  # Result of the previous pass

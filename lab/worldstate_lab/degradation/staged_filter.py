@@ -99,7 +99,7 @@ def filter_in_conditions(
 
 def _heard(source: Source, level: int, dry_rms: float, seed: int | Sequence[int]) -> list[Measurement]:
     """Return the measurements of a recording or stream at a level of rain on the roof."""
-    # The same noise at every level, only louder, so that differences between levels do not come from the
+    # Every level has the same noise, only louder, so that differences between levels do not come from the
     # noise.
     wet = rained(source, level, dry_rms, np.random.default_rng(seed)) if level else source
     return [measured for _, measured in measure_steps(wet)]

@@ -46,7 +46,7 @@ ALPHA = 0.02
 
 
 class Progress(Interface):
-    """Reports progress: yields the items of a step whose number is known."""
+    """Reports progress while it yields the items of a step; their number is known."""
 
     def __call__(self, items: Iterable[Item], description: str, total: int, /) -> Iterator[Item]:
         """Yield the items."""
@@ -83,7 +83,7 @@ class Evaluation:
 
 
 def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, str]:
-    """Return what each protocol lacks that cannot be run; raise an error if none can be run."""
+    """Return, for each protocol that cannot be run, what it lacks; raise an error if none can be run."""
     every = (*takes.static, *takes.dynamic)
     lacking = {one.name: what for one in PROTOCOLS if (what := one.lacks(every)) is not None}
     if len(lacking) == len(PROTOCOLS):

@@ -30,7 +30,7 @@ class Protocol:
     trained_on: TrainedOn = "all"  # Training data of the published classifier
 
     def lacks(self, takes: Sequence[Take]) -> str | None:
-        """Return what is missing for this protocol, or None; no recording is processed for it."""
+        """Return what is missing for this protocol, or None, without processing a recording."""
         chosen = [take for take in takes if take.moving == self.moving]
         counts = Counter("none" if take.hazard_free else "approach" for take in chosen)
         least = {"approach": 2, "none": 2}

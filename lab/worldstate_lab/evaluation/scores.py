@@ -237,7 +237,7 @@ class Score:
         }
 
     def _random_detection(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the share that as many onsets at random moments before T0 would detect, shape (S, D)."""
+        """Return the share of approaches that as many random onsets before T0 would detect, shape (S, D)."""
         rates = np.full(sums["before_s"].shape, np.nan)
         times = weights * ~self._free
         for s, before_s in enumerate(sums["before_s"]):
@@ -320,8 +320,8 @@ def _bearing_figures(samples: HopTable, weights: FloatArray) -> dict[str, FloatA
 
 BASELINE, OURS = "published, sustained", "world-state advisory"
 DETECTED = (0.8, 0.85, 0.9, 0.95)
-# Quantiles used as thresholds. Hazard-free: dense where few alarms remain. Before T0: including the highest
-# score of each approach, above which the approach is missed.
+# Quantiles used as thresholds. Those of hazard-free hops are dense where few alarms remain. Those before T0
+# include the highest score of each approach, above which the approach is missed.
 _CALM_SHARES, _NEAR_SHARES = np.geomspace(1e-5, 0.5, 60), np.linspace(0.0, 1.0, 30)
 _COUNTS = ("approaches", "detected", "free_hops", "free_onsets")
 # Maps a score and a threshold to the alarm of a recording.

@@ -52,9 +52,10 @@ class WindowMethod:
     # Reference of the scored windows, None if the method uses none. Training is the same in any case, as in
     # `model fit`.
     reference: Reference | None = None
-    # Whether it is for sites unlike those of training. Then threshold and map come only from folds like the
-    # outer ones, and under `transfer` risks are shifted until hazards are as frequent as in training.
-    # Otherwise the threshold of an ensemble is a compromise between folds by junction and folds by recording.
+    # Whether the method is for sites unlike those of training. Its threshold and map then come only from
+    # folds like the outer ones, and under `transfer` risks are shifted until hazards are as frequent as in
+    # training. Otherwise the threshold of an ensemble is a compromise between folds by junction and folds by
+    # recording.
     afar: bool = False
     # Training function, if it needs more than windows and labels; otherwise `make` is used.
     fit: Callable[[FeatureTable], Classifier] | None = None
@@ -97,7 +98,7 @@ class WindowMethod:
     ) -> dict[float, tuple[WindowCalibration, float]]:
         """Return threshold, risk map and the mean risk of the training windows, for each beta."""
         like_outer: Protocol = "cv" if protocol == "cv" else "lojo"
-        # From the most cautious to the least cautious.
+        # The folds are ordered from the most to the least cautious.
         both = self.reference is not None and not self.afar and like_outer == "lojo"
         inner: tuple[Protocol, ...] = ("lojo", "cv") if both else (like_outer,)
         asks = self.asks(train, rng)
@@ -140,7 +141,7 @@ def asked_under(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predictions:
-    """Predictions for every window of one table, one each."""
+    """One prediction for every window of a table."""
 
     folds: TextArray  # shape (n,): Fold in which each window was held out
     probabilities: FloatArray  # shape (n, 4): Posteriors of front, left, none, right

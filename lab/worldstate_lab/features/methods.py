@@ -64,9 +64,10 @@ def _site_ensemble(rng: np.random.Generator, simulated: SimulatedWindows | None)
 
 
 def _distant_site(rng: np.random.Generator) -> Classifier:
-    # Only the quiet reference, with weak regularisation. The ridge favours the level, which is masked by the
-    # noise of a moving ego; the pattern relative to the quietest windows remains. Chosen among about thirty
-    # recipes for each moving junction on the other two, with the same result three times.
+    # Only the quiet reference is used, with weak regularisation. A stronger ridge favours the level, which is
+    # masked by the noise of a moving ego; the pattern relative to the quietest windows remains. The recipe
+    # was chosen among about thirty, for each moving junction on the other two, with the same result three
+    # times.
     return SiteEnsembleClassifier((Recipe("quiet", 1e-5),))
 
 

@@ -50,7 +50,7 @@ def best_sustain(calibration: Sequence[Trial], evidence: str) -> int:
                 found.append(onset_outcome(onsets, trial.t0_s).detected)
         return _share(found) - _share(alarmed)
 
-    # Among equals the smallest, which gives the longest lead time.
+    # Among equal gains the smallest k is used, which gives the longest lead time.
     return max(SUSTAIN_CHOICES, key=lambda hops: (gain(hops), -hops))
 
 

@@ -261,7 +261,7 @@ def _hops_beside(
 
 
 def _kept(streams: Sequence[PassedStream]) -> Figures:
-    """Return how often an entity is near a vehicle in the three seconds after T0, and how many are."""
+    """Return how often an entity is near a vehicle in the 3 s after T0, and how many entities are."""
     near = []
     for stream, one, hop, azimuth in _hops_beside(streams, 0.0, KEPT_S):
         if one.flow == "single":
@@ -287,8 +287,8 @@ def _forecast(streams: Sequence[PassedStream]) -> Figures:
     }
 
 
-# Vehicles that leave are compared in an interval around their loudest moment as long as that of approaching
-# vehicles before T0, if no other vehicle comes near that time.
+# The risk of leaving vehicles is taken in an interval around their loudest moment. It is as long as the
+# interval of approaching vehicles before T0, and no other vehicle may come near that time.
 _COMPARED_S, _ALONE_S, CERTAIN = 3.0, 10.0, 0.8
 
 
@@ -440,8 +440,8 @@ def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool,
             continue
         behind = one.sides[0] == one.sides[1]
         before = int(np.searchsorted(followed.time_s, one.entries_s[0] - SLACK_S)) - 1
-        # By its share of that side, because an entity of unknown side may be the first vehicle's too. Behind
-        # another vehicle, the likeliest entity is the first vehicle's.
+        # Entities are chosen by their share of that side, because one of unknown side may be the first
+        # vehicle's too. If both vehicles come from one side, the likeliest entity belongs to the first.
         hidden = sorted(followed.hidden(before, one.sides[1], STATED), key=lambda e: -e.existence_probability)
         stated = {e.id for e in hidden[behind:]}
         first, second = (_seen_after(stream, entry_s) for entry_s in one.entries_s)

@@ -163,7 +163,8 @@ def _transitions(dt_s: float) -> tuple[FloatArray, FloatArray]:
     rate = 0.5 * (SPEED_NOISE / (SPEEDS_MPS[1] - SPEEDS_MPS[0])) ** 2
     generator = rate * (np.eye(number, k=1) + np.eye(number, k=-1))
     middle = number // 2
-    # Between the slowest speeds to the left and to the right the vehicle would have to stop: this is a turn.
+    # A change between the slowest speeds to the left and to the right is a turn, because the vehicle has to
+    # stop.
     generator[middle - 1, middle] = generator[middle, middle - 1] = 0.0
     generator += TURNS_HZ * np.eye(number)[::-1]
     generator -= np.diag(generator.sum(axis=1))

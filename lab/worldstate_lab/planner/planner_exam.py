@@ -56,10 +56,10 @@ def drive_through(
 ) -> Drives:
     """Drive through all encounters, braking for visible and for assumed vehicles.
 
-    A vehicle at the speed limit is assumed just beyond the visible part of a side as long as the chance that
-    a vehicle comes into view from there within `HORIZON_S` is at least the threshold: always at 0, never at
-    infinity. With memory, the
-    assumed vehicle is no nearer than a vehicle that was never in sight can be.
+    A vehicle at the speed limit is assumed just beyond the visible part of a side if the chance that a
+    vehicle comes into view from there within `HORIZON_S` is at least the threshold. With a threshold of 0 it
+    is always assumed, with infinity never. With memory, the assumed vehicle is no nearer than a vehicle that
+    was never in sight can be.
     """
     assumed = encounters.within[..., HORIZONS_S.index(HORIZON_S)] >= threshold
     n = len(encounters)
@@ -78,7 +78,7 @@ def drive_through(
         first_seen = np.minimum(first_seen, np.where(visible, step, STEPS * 2))
         hop = max(step - late, 0) // HOP_STEPS
         free = np.minimum(ego.acceleration_mps2, (ego.limit_mps - v) / STEP_S)
-        # The view just opened is used only after the reaction time.
+        # A view that has just opened is used only after the reaction time.
         then = sight_m(encounters, fronts[:, max(step - late, 0)] - ego.eye_m)
         reach = unseen_from_m(reach, then, ego.limit_mps * STEP_S) if remembers else then
         for_hidden = _for_assumed(encounters, ego, x, v, reach, assumed[:, hop])
@@ -110,9 +110,9 @@ def unseen_from_m(before_m: FloatArray, sight_m: FloatArray, driven_m: float) ->
 
     .. math:: R(t) = \max(S(t), R(t - \Delta t) - v \Delta t) = \max_{t' \le t} S(t') - v (t - t')
 
-    S is the visible length of the lane and v the highest speed. R is reached by a vehicle at v that was at
-    the edge of sight at the maximising t'. While S grows, R equals S: a vehicle just beyond the edge came
-    from farther behind it, unseen.
+    S is the visible length of the lane and v the highest speed. A vehicle at speed v that was at the edge of
+    sight at the maximising t' is now at the distance R. While S grows, R equals S: a vehicle just beyond the
+    edge may have come from farther away without being in sight.
 
     Examples
     --------
@@ -243,7 +243,7 @@ def approaches_drawn(
 
 
 def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
-    """Return the threshold below the largest one without collisions; 0, the phantom, if there is none."""
+    """Return the threshold one step below the largest one without collisions; 0 (phantom) without one."""
     # A threshold without collisions in about 130 approaches may cause one elsewhere: one step is kept as a
     # margin.
     kept = 0.0
@@ -285,7 +285,7 @@ def planner_figures(
 
 
 def _with_mean(recorded: IndexArray, rng: np.random.Generator) -> FloatArray:
-    """Return weights of replays, equal ones first, then for draws of the recorded items; each sums to one."""
+    """Return weights of replays, each row with sum 1: equal weights, then one row per draw of items."""
     which, members = np.unique(recorded, return_inverse=True)
     drawn = draw_weights(stratified_draws([0] * which.size, rng), which.size)[:, members]
     every = np.concatenate([np.ones((1, recorded.size)), drawn])

@@ -53,7 +53,7 @@ def heard_every_way(chain: Chain, recording: CornerRecording) -> tuple[Trial, Tr
 
 
 def _with_meter(trial: Trial, recording: CornerRecording) -> Trial:
-    """Add `meter_db`, the level of channel 1 above its quiet level so far, and the time for leads."""
+    """Add `meter_db`, the level of channel 1 above its quiet level so far, and `leads_from_s`."""
     sound, rate_hz = recording.samples()
     hops = int(len(sound) / rate_hz * HOP_RATE_HZ)
     pressure_pa = FULL_SCALE_PA * sound[: round(hops * rate_hz / HOP_RATE_HZ), 0].astype(np.float64)

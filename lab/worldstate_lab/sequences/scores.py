@@ -202,7 +202,7 @@ def _false_alarms(tables: Sequence[ApproachTable]) -> Row:
     return {
         "onsets": onsets,
         "alarms_per_hour": onsets / hours,
-        # All passes cover the same hours: their mean count is one count.
+        # All passes cover the same hours, so their mean count is treated as one count.
         "interval": poisson_interval(round(onsets), hours),
         "false_recordings": sum(bool(one.any()) for one in calm) / len(tables),
         "advisory_share": mean_of(np.concatenate(calm)),
@@ -212,9 +212,9 @@ def _false_alarms(tables: Sequence[ApproachTable]) -> Row:
 def at_onsets(
     trials: Sequence[Trial], scores: Sequence[FloatArray], rng: np.random.Generator
 ) -> dict[str, Row]:
-    """Return the row of the best threshold with at most this many onsets, by their number: a curve.
+    """Return a curve: for each number of onsets, the row of the best threshold with at most that many.
 
-    Each row has one threshold: that with the most warned recordings, and among equals the longest mean lead.
+    The best threshold has the most warned recordings and, among equals, the longest mean lead.
     """
     return _curve(trials, scores, "onsets", ONSETS, rng)
 
@@ -243,7 +243,7 @@ def _curve(
 
 
 def sweep(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> Mapping[str, FloatArray]:
-    """Return onsets, false recordings, warned and summed lead of every threshold, shape (levels,) each."""
+    """Return onsets, false and warned recordings, and summed lead by threshold, shape (levels,) each."""
     levels = np.append(np.unique(np.concatenate(scores)), np.inf)
     found = {name: np.zeros(len(levels)) for name in ("onsets", "false_recordings", "warned", "lead_s")}
     for trial, score in zip(trials, scores, strict=True):
@@ -261,7 +261,7 @@ def sweep(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> Mapping[str,
 
 
 def calibration(trials: Sequence[Trial], rng: np.random.Generator, *, within_s: float = WITHIN_S) -> Row:
-    """Return calibration and skill of the chances that a vehicle comes into view in time on a side.
+    """Return calibration and skill of the chances that a vehicle comes into view within a time on a side.
 
     Both sides are used, at hops before T0 of approaches and at all hops of hazard-free recordings.
     """

@@ -29,7 +29,8 @@ from .recordings import CornerRecording
 # Half of the camera's 1936 pixels: crops of 832 pixels become the network's 416, and staging takes a quarter
 # of the time.
 WIDTH_PX, REDUCED = 968, 2.0
-# The crops begin in an odd row: without its first and last row, an image is halved along their edges.
+# The crops begin in an odd row: without its first and last row, an image is halved along the edges of the
+# crops.
 _LEFT_OUT_ROWS = 1
 MODEL = Path("detector", "nanodet_m.onnx")
 # Searching every second image halves an hour of inference; a motion detector needs every image.

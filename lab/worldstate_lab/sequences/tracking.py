@@ -33,8 +33,9 @@ from worldstate_lab.trials.listening import LIKELY, box_table, frame_row, refere
 from .hearing import Chain
 from .recordings import CornerRecording
 
-# Boxes jump by up to 14 degrees when a vehicle leaves one crop of the detector for the next. With the 8
-# degrees of pass labels, half of the vehicles have 11 boxes or fewer, with 15 they have 17.
+# Boxes jump by up to 14 degrees when a vehicle leaves one crop of the detector for the next. With a limit of
+# 8 degrees, as for pass labels, half of the vehicles have 11 boxes or fewer; with 15 degrees the median is
+# 17.
 NEAR_RAD = math.radians(15.0)
 EARLY_S = 0.3  # T0 agrees with the images to within this time
 HIDDEN_S, STATED_S = 1.0, 3.0  # Times before T0, for hidden entities and for times to visible
@@ -199,8 +200,9 @@ def _moving_in(boxes: HopTable, image: int) -> IndexArray:
 
 def _oc_sort(boxes: HopTable, min_score: float, images: int) -> dict[int, list[float]]:
     """Return the azimuths that OC-SORT predicts in every second image, which it does not receive."""
-    # It steps from one received image to the next: with empty steps between, no track would have enough
-    # consecutive boxes to be confirmed. Half of its last motion predicts the track in the image between.
+    # The tracker steps from one received image to the next: with empty steps between, no track would have
+    # enough consecutive boxes to be confirmed. Half of a track's last motion predicts its position in the
+    # image between.
     camera, sort, found = PinholeCamera.ovad(), OcSort(min_score), dict[int, list[float]]()
     last: dict[int, float] = {}
     for image in range(0, images, 2):

@@ -81,7 +81,7 @@ def held_out(
 
 
 def _folds(table: ClipSignatures, rng: np.random.Generator) -> IndexArray:
-    """Assign recordings to folds so that training without any fold is possible, shape (n,) of the clips."""
+    """Assign recordings to folds so that training is possible without any one of them, shape (n,)."""
     names, of_clip = np.unique(table.recordings, return_inverse=True)
     held = [
         (table.motor[of_clip == i].any(), table.background[of_clip == i].any()) for i in range(len(names))
@@ -248,12 +248,12 @@ class _Question:
 
 
 QUESTIONS = (
-    # Training and test on different recordings of one corpus; quiet road users with a model that was not
-    # trained on them.
+    # Training and test use different recordings of one corpus. Quiet road users are tested with a model that
+    # was not trained on them.
     *(_Question(by, IDMT, IDMT, microphone) for by in BYS for microphone in ("studio", "mems")),
     *(_Question(by, MELAUDIS, MELAUDIS, "phone", kind) for by in BYS for kind in (VEHICLE, *QUIET)),
-    # Test on the other corpus. The accuracy shows a shift of the threshold by another gain, which an area
-    # cannot show.
+    # These rows test on the other corpus. The accuracy shows whether another gain shifts the threshold, which
+    # an area cannot show.
     *(_Question(by, *way, figure=figure) for by in BYS for way in BOTH_WAYS for figure in FIGURES),
     *(_Question("shape", IDMT, MELAUDIS, kind=kind) for kind in QUIET),
 )

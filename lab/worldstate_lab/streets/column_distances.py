@@ -1,8 +1,8 @@
 r"""Distance between sequence inputs in simulated streams and in real recordings, by column.
 
 Streams are cut into excerpts as long as recordings, with T0 at the same time, and both are processed alike:
-the approach comes from the left, and levels are dB above the quietest fifth of the excerpt so far, as in the
-sequence model. The distance of two junctions in a column is the energy distance,
+approaches from the right are mirrored, and levels are dB above the 20 % quantile of the excerpt so far, as in
+the sequence model. The distance of two junctions in a column is the energy distance,
 
 .. math:: D^2 = \overline{|X - Y|} - \tfrac12 \overline{|X - X'|} - \tfrac12 \overline{|Y - Y'|},
 
@@ -101,7 +101,7 @@ def _autocorrelation(rows: FloatArray, lag_s: float) -> FloatArray:
 
 
 def stream_excerpts(heard: HeardStream, columns: FloatArray) -> list[Excerpt]:
-    """Cut a stream into excerpts: approaches without another vehicle in view before, or all of a quiet one.
+    """Cut a stream into excerpts: approaches without an earlier vehicle in view, or all of a hazard-free one.
 
     Shapes: columns (n, 13), one row per hop.
     """
@@ -209,7 +209,7 @@ def _pairwise(every: Sequence[Excerpt], name: str, width: FloatArray) -> FloatAr
 
 
 def _squared(pairwise: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the squared distance of each pair of parts, given how often each contains every excerpt.
+    """Return the squared distance of each pair of parts; `times` is how often a part contains an excerpt.
 
     Shapes: pairwise (statistics, n, n, 11), times (parts, n), returns (parts, parts, 11).
     """

@@ -1,8 +1,8 @@
 """Distances between simulated and real windows, compared with distances between real junctions.
 
 Every figure of simulated against real windows is compared with the same figure of real against real. It is
-inside if it is no worse than between some real junctions. Absolute figures mislead: boosting separates real
-junctions from one another with 0.92 to 0.96.
+inside if it is no worse than the figure between some real junctions. Absolute figures mislead: boosting
+separates even real junctions from one another with an area of 0.92 to 0.96.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -43,7 +43,8 @@ _ASKED: dict[FigureKey, Span] = {
     ("side, real to simulated", "mean"): (0.75, 1.0),  # 0.95
     ("side, simulated to real", "mean"): (0.75, 1.0),
 }
-# No site may have a side accuracy below chance, and no classifier may rank as well with wrong positions.
+# No site may have a side accuracy below chance, and no classifier may rank windows as well with wrong
+# microphone positions as with the true ones.
 _ASKED_BY_FIGURE: dict[str, Span] = {
     "side, real to simulated": (0.5, 1.0),
     "side, simulated to real": (0.5, 1.0),
@@ -95,7 +96,8 @@ def halves(sites: list[str]) -> tuple[Grouping, ...]:
     >>> [str(one) for one in halves(["SA1", "SA2", "SB1", "SB2"])]
     ['SA1 SB1 | SA2 SB2', 'SA1 SB2 | SA2 SB1']
     """
-    # Nearly equal: any single junction is separated from four others with an area of 0.99.
+    # Sets of nearly equal size, because any single junction is separated from four others with an area of
+    # 0.99.
     found = []
     for one in combinations(sites, len(sites) // 2):
         other = tuple(name for name in sites if name not in one)
@@ -197,8 +199,8 @@ def pair_rows(
     for figure, windows in keys:
         undirected = figure.partition(",")[0], windows
         between, within = by_halves.get(undirected), by_junction.get(undirected)
-        # A single measure may differ as much as between any two real junctions; other figures as between
-        # groupings.
+        # A single measure may differ as much as between any two real junctions; other figures may differ as
+        # much as between groupings.
         spans = [span for span in (between, within if figure.startswith("AUROC of") else None) if span]
         key = figure, windows
         found = {name: figures[key] for name, figures in ours.items() if key in figures}
@@ -260,7 +262,7 @@ def set_rows(
     real: FeatureTable, simulated: Mapping[str, FeatureTable], groupings: Iterable[Grouping]
 ) -> list[RealismRow]:
     """Return the figures of a single set, compared with halves of the real junctions."""
-    # Halves show the variation for so few streets: the spread of two or three junctions.
+    # Halves of the real junctions show how much a figure varies over two or three junctions.
     parts = [part for grouping in groupings for part in grouping.tables(real)]
     # A share between sites needs at least two sites.
     spans = _spans(set_figures(part) for part in parts if len(set(part.environments.tolist())) > 1)
@@ -306,7 +308,7 @@ Profile = tuple[tuple[float, ...], ...]  # Halves x far azimuths
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Realism:
-    """The comparison: figures, transfers with intervals, and the odd part by side at each junction."""
+    """The comparison: figures, transfers with intervals, and the odd profiles of each junction."""
 
     groupings: tuple[str, ...]
     rows: tuple[RealismRow, ...]
@@ -376,7 +378,7 @@ def measure_realism(
     groupings = (halves(sites) if len(sites) > 1 else (), within_types(sites))
     # The figures of real against real must not depend on the simulation.
     of_real, of_simulated = rng.spawn(2)
-    # Each direction once, with its interval: the rows use the same areas.
+    # Each direction is computed once, with its interval; the rows use the same areas.
     transfers = {}
     for name, table in simulated.items() if classifiers else ():
         transfers[f"{name} -> real"] = published_transfer(table, real, of_simulated, draws)

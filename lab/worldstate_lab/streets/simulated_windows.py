@@ -87,7 +87,8 @@ def spread_values(features: FloatArray) -> dict[str, FloatArray]:
 
 # (name of the figure, class of windows); the class is "all" if the figure concerns several.
 FigureKey = tuple[str, str]
-# Azimuths of mirror images in the side walls of the ego's own street: 89 % of the real hidden peaks.
+# Peaks at these azimuths are mirror images in the side walls of the ego's own street: 89 % of the real hidden
+# peaks.
 WIDE_DEG = (40.0, 65.0)
 # Spreads and shares of fewer windows are dominated by chance.
 LEAST_WINDOWS = 5

@@ -155,8 +155,8 @@ def windows_of(trials: Sequence[Trial]) -> FeatureTable:
 
 # Increased whenever the same windows would give a different model.
 VERSION = 2
-# Gives 170 windows each of left and right together, front, and none at the five standing sites. The released
-# set has 170, 170 and 158 without its 42 + 42 and 41 test windows.
+# Gives 170 windows of each kind at the five standing sites: left and right together, front, and none. The
+# released set has 170, 170 and 158 without its 42 + 42 and 41 test windows.
 PER_APPROACH = 17
 
 

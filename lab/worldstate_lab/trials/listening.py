@@ -118,8 +118,7 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
 
 def model_refusal(take: Take, model: Model) -> str | None:
     """Return why a model does not fit the sound of a recording; None if it does, or specifies no array."""
-    # Uncalibrated, the chain has no sequence model, but no error is raised before the reason is returned
-    # here.
+    # An uncalibrated chain has no sequence model, but it raises no error before the reason is returned here.
     source = open_source(take.path, model=model, settings=replace(CHAINS["plain"], uncalibrated=True))
     domain = model.domain
     if domain is None:
@@ -209,7 +208,7 @@ def pass_time_s(truth: HopTable) -> float | None:
 def frame_row(frame: AcousticFrame) -> tuple[Any, ...]:
     """Return the values of a hop that methods use, so that an hour of sound needs only about 10 MB."""
     slope = np.nan if isinstance(frame.looming, NotUsable) else frame.looming.log_slope_hz
-    # Of the decision window and not of the shorter window of the bearing: the paper's prominence.
+    # The paper's prominence is that of the decision window, not of the shorter window of the bearing.
     median = float(np.median(frame.srp))
     prominence = float(frame.srp.max()) / median if median else 1.0  # No sound
     return frame.feature, prominence, slope, frame.bearing_rad
@@ -218,8 +217,8 @@ def frame_row(frame: AcousticFrame) -> tuple[Any, ...]:
 def _decided(state: WorldState) -> tuple[Any, ...]:
     raised = [cue for cue in state.cues if cue.advisory]
     told = max(raised or state.cues, key=lambda cue: cue.risk, default=None)
-    # The value that the alarm compares with its threshold, as a probability: with another threshold, it would
-    # decide.
+    # The score is the value that the alarm compares with its threshold, as a probability, so that other
+    # thresholds can be applied to it.
     nats = max((cue.evidence.compared_nats for cue in state.cues if cue.evidence), default=np.nan)
     score = 1.0 / (1.0 + np.exp(-nats))
     side = SIDES.get(told.direction or "", NO_SIDE) if raised and told is not None else NO_SIDE
@@ -228,8 +227,8 @@ def _decided(state: WorldState) -> tuple[Any, ...]:
 
 def _bearing(state: WorldState) -> float:
     """Return the azimuth of the moving entity with the highest existence probability, NaN if none exists."""
-    # Not the azimuth of a cue: with a vehicle in view, both hidden sides have a negligible risk, at 55
-    # degrees.
+    # The azimuth of a cue is not used: with a vehicle in view, both hidden sides have a negligible risk, at
+    # 55 degrees.
     likely = [one for one in state.entities if one.moving and one.existence_probability >= LIKELY]
     strongest = max(likely, key=lambda one: one.existence_probability, default=None)
     return np.nan if strongest is None else strongest.azimuth_rad

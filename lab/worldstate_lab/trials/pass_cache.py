@@ -212,7 +212,7 @@ class Hearer:
     def __call__(self, take: Take) -> Trial:
         """Process one recording, or read the cached results for the same content."""
         mark = fingerprint(take.path, self.folder / "fingerprints")
-        # The shipped model for a moving ego is another one, and its chains use it.
+        # A moving ego has its own shipped model, which its chains use.
         model = read_model(self.model, moving_ego=take.moving)
         array = named_array(take.path)
         about = [VERSION, take.name, take.label, take.t0_s, take.site, mark]

@@ -141,7 +141,7 @@ class Trial:
 
     @property
     def refused(self) -> Mapping[str, str]:
-        """By chain or score that is missing: why the model does not fit this sound."""
+        """For each missing chain or score, the reason why its model does not fit this sound."""
         return dict(self.hops.about.get("refused", {}))
 
     @property

@@ -286,7 +286,7 @@ def _data_section(found: Evaluation) -> Section:
         if found.takes.simulated
         else "The figures are measured on the given recordings."
     )
-    # A stratum of one recording is equal in every draw, and the interval does not show it.
+    # A stratum of one recording is the same in every draw, so the interval does not contain its variation.
     strata = Counter((trial.label, trial.site) for trial in found.trials)
     single = sum(count == 1 for count in strata.values())
     intervals = (

@@ -25,7 +25,7 @@ _RAIN = ("level", "noise (dB)", "lens alone", "roof alone", "rain", "if effects 
 
 
 def sweep_values(study: DegradationStudy) -> dict[Place, Value]:
-    """Return measured values for the paper's sweep, of the first detector; a larger detector comes last."""
+    """Return measured values for the paper's sweep: of the first detector, and one of the last."""
     first, last = study.sweeps[0], study.sweeps[-1]
     beta, clean = first.beta, (0, 0)
     values = {
