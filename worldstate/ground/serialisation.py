@@ -198,7 +198,7 @@ def decode_json(text: str, where: str) -> object:
 
 
 def decode_items(text: str, at: int, take: Callable[[object], object], where: str) -> int:
-    """Decode a list inside a JSON text item by item, without a limit on their number.
+    """Decode a list inside a JSON text item by item, for any number of items.
 
     Parameters
     ----------

@@ -432,7 +432,7 @@ class CoEvidenceChannel(Protocol):
         expected_labels: Collection[str] | None = None,
         side: Side | None = None,
     ) -> CoEvidence:
-        """Search the sector around the bearing, or a whole side; without labels, for the usual classes."""
+        """Search the sector around the bearing, or a whole side, for the given or the usual classes."""
         ...
 
     def sightings(self, stamp_ns: int) -> tuple[Sighting, ...]:

@@ -134,9 +134,9 @@ class SmoothingSettings:
         Residual, in standard deviations, above which the Huber loss of bearings, approach rates and boxes
         grows linearly.
     manoeuvre_k : float or None
-        Scale of the Cauchy loss of the motion between two states, whose whitened norm is 2 on average. A
-        driver then keeps the pace most of the time and sometimes brakes, accelerates or turns off, at a lower
-        cost than under white acceleration. None for a Gaussian loss.
+        Scale of the Cauchy loss of the motion between two states, whose whitened norm is 2 on average. The
+        loss fits drivers who keep their pace most of the time and sometimes brake, accelerate or turn off:
+        such manoeuvres cost less than under white acceleration. None for a Gaussian loss.
     relinearize_every : int
         Number of updates between two relinearisations.
 

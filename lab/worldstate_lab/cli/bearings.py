@@ -1,13 +1,15 @@
 """`worldstate-lab bearings`: calibration of stated standard deviations, and errors of bearings beside peers.
 
 Sources surround rings of 4 to 8 microphones, 3 to 10 cm in radius, in simulated rooms (reverberation 0.3 to
-0.8 s, noise 5 to 20 dB below) and in the open. Of three seconds, the hops that share no frame are used. The
-methods of pyroomacoustics run on the same STFT frames, band and azimuths. With --streams, hops of streets
-with a vehicle in view within 20 m are evaluated; the error is the distance to the nearest vehicle in azimuth.
+0.8 s, noise 5 to 20 dB below the source) and in the open. Each sound lasts three seconds, and only hops that
+share no frame are used. The methods of pyroomacoustics run on the same STFT frames, band and azimuths. With
+--streams, hops of streets with a vehicle in view within 20 m are evaluated; the error is the distance to the
+nearest vehicle in azimuth.
 
-`z` is the root mean square of error over stated deviation, `surest_half` the mean of its square in the half
-of the hops with the smallest deviation, `median_deg` the median error of all hops, of the surest half and of
-the surest sixth. Hops without a bearing are the least sure. `beyond_60_deg` is the share of larger errors.
+`z` is the root mean square of error over stated deviation, and `surest_half` the mean of its square in the
+half of the hops with the smallest deviation. `median_deg` is the median error of all hops, of the surest half
+and of the surest sixth; hops without a bearing count as the least sure. `beyond_60_deg` is the share of
+larger errors.
 
 Examples
 --------

@@ -1,10 +1,10 @@
 """`worldstate-lab card`: figures of the simulated exam and of real recordings, for a model's card.
 
---streams examine MODEL as `worldstate model make` does: with streams of its array, of junctions and seeds
-that are not in its training, with and without hazards. --real takes the AUROC one second before T0 and the
-share of announced approaches, both by sound alone, from the results of `worldstate-lab sequences` over both
-paths. The figures of seven microphones belong to a model of the roof array with a standing ego; every model
-gets the gap of the pair, simulated exam against recordings.
+With --streams, MODEL is examined as by `worldstate model make`: on streams of its array, of junctions and
+seeds that are not in its training, with and without hazards. --real takes the AUROC one second before T0 and
+the share of announced approaches, both by sound alone, from the results of `worldstate-lab sequences` over
+both paths. The figures of seven microphones belong to a model of the roof array with a standing ego; every
+model gets the gap of the pair between simulated exam and recordings.
 
 Examples
 --------

@@ -8,8 +8,9 @@ row of the table).
 
 The output has, by kind, the shares of hops that are familiar, foreign or a warning signal, the mean
 probability of each class of road users, and the largest change of any of these if the recorder's response
-rises or falls by 6 dB over the band. For clips with a road_user it has the log-loss and that of the shares of
-the table, to which the probabilities are corrected. Every recording has the same weight.
+rises or falls by 6 dB over the band. For clips with a road_user it has the log-loss of the model, corrected
+to the shares of the classes in the table, and the log-loss of these shares alone. Every recording has the
+same weight.
 
 Examples
 --------

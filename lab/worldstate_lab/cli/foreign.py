@@ -153,7 +153,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     sites = sorted({str(stream.hops.about["site"]) for stream in streams})
     if len(sites) < SITES:
         raise InvalidArgumentError(f"NPZ: expected streams of {SITES} sites or more, got {', '.join(sites)}")
-    # One microphone is used; which array it belongs to changes nothing but the level.
+    # One microphone is used; the choice of its array changes nothing but the level.
     rng = np.random.default_rng(arguments.seed)
     rows = guard_rows(ovad_array(), streams, rng, arguments.sounds)
     rows = SoundRows.joined([rows, of_guard(close_rows(GUARD_RATE_HZ, rng, CLIPS_EACH))])

@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     sites = list(dict.fromkeys(one.site.name for one in plan))
     rng = np.random.default_rng(arguments.seed)
     rate_hz = plan[0].sample_rate_hz
-    # One microphone is used; one of another array would record the same, and no level is read.
+    # One microphone is used: one of another array would record the same, and the level is not used.
     passes, jobs = arguments.passes, arguments.jobs
     with progress_bar("rendering", passes * len(sites)) as bar:
         rows = road_user_rows(

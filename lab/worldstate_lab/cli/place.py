@@ -149,7 +149,7 @@ _NAME = re.compile(r"(Site[12])_([LR])_(\d+)_Trial\d+")
 _COUNTS = {
     "hops": "hops",
     "hidden_hops": "hidden",
-    "side_right": "side",  # Hidden hops in which the likelier side is right
+    "side_right": "side",  # Hidden hops in which the likelier side is correct
     "stated": "stated",  # Share of hops with a stated position
 }
 _ERRORS = {
@@ -246,7 +246,7 @@ def _hidden(along_m: FloatArray, walls: StreetWalls) -> BoolArray:
 
 def _likely_sides(table: SpectrumTable, side: str, speed_mps: float, walls: StreetWalls) -> FloatArray:
     """Return the sides of a trial without positions."""
-    # It crosses the axis at the clearest change of side of the loudest directions within the mouth.
+    # The vehicle crosses the axis when the loudest directions within the mouth change side most clearly.
     within = np.abs(AZIMUTHS_RAD) < np.arctan2(min(walls.left_m, walls.right_m), walls.corner_ahead_m)
     loudest = AZIMUTHS_RAD[within][table.spectra[:, within].argmax(axis=1)]
     first = 1.0 if side == "left" else -1.0

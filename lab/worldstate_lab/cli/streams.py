@@ -4,11 +4,12 @@ Streams kept by `worldstate model make` pass through the filter hop by hop, with
 their truth. The output has for every junction and for all: announced approaches and their lead (from eight
 seconds before T0 on), onsets per hour without an approach, detection of both vehicles of a pair, kept
 identities, advisories after the pass, errors of times and bearings, and the performance of a sound level
-meter. For the second vehicle from the other side, and for a follower, it has by the gap to the first: the
-probability to come within three seconds if it adds a decibel to the sound or less, and the result of its
-entity. It also has onsets per hour by kind of hazard-free traffic. "worst" is over junctions with at least
-eight cases. With --days, days are drawn from the streams with their own rate of false onsets, the budgeted
-rate and more: how often the watch reports a broken budget, and after how many hours.
+meter. It has two further figures for the second vehicle, from the other side or as a follower, by its gap to
+the first: the probability to come within three seconds, if it adds at least a decibel to the sound and if it
+adds less, and whether its entity is kept apart. It also has onsets per hour by kind of hazard-free traffic.
+"worst" is over junctions with at least eight cases. With --days, days are drawn from the streams with their
+own rate of false onsets, the budgeted rate and higher rates; the output then has how often the watch reports
+a broken budget, and after how many hours.
 
 The streams must have other seeds and, for a fair figure, other junctions than the model's training.
 

@@ -10,8 +10,8 @@ one, streets are simulated into OUT/streets (12 GB), and the report states it. T
 of the official lists if they are in the folder (or --static-ids, --dynamic-ids), else all.
 
 The published classifier is trained on --features, a table of windows such as the released one, without
-windows of tested recordings; else on the recordings that are not tested; on simulated streets on other
-simulated recordings; else on the calibration recordings of each fold.
+windows of tested recordings. Without --features it is trained on the recordings that are not tested; for
+simulated streets, on other simulated recordings; otherwise on the calibration recordings of each fold.
 
 OUT/report.md has every table and figure beside the paper's, OUT/report_files the same as PNG and CSV.
 

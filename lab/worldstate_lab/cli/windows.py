@@ -72,7 +72,7 @@ from worldstate_lab.metrics.intervals import (
     worst_rate,
 )
 
-# The floor belongs to the risks: another seed per run would only add noise.
+# The floor depends on the risks alone: another seed per run would only add noise.
 FLOOR_SEED = 0
 Figures = dict[str, float | None]
 DEVIATING = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "fpr", "ece")

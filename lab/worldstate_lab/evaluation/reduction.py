@@ -34,7 +34,7 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     t0_s = in_range(f"{trial.name}: line-of-sight entry", trial.t0_s, -np.inf, np.inf)
     lead_s = t0_s - said.time_s
     before = lead_s > SLACK_S
-    # Relative to T0, so that the lead is bit-identical and matches its hop.
+    # Times are relative to T0, so that the lead is bit-identical and matches its hop.
     outcome = onset_outcome(-lead_s[onsets], 0.0)
     first = onsets[lead_s[onsets] == outcome.lead_s]
     named = int(said.side[first[0]]) if outcome.detected else NO_SIDE

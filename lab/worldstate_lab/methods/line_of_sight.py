@@ -128,7 +128,7 @@ def _early_s(trial: Trial) -> float:
     # Before the first hop, parked and moving cars cannot be distinguished.
     scored = boxes.time_s >= trial.hops.time_s[0] - SLACK_S
     early_s = trial.t0_s - float(boxes.time_s[scored & boxes.moving.astype(bool)].min(initial=np.inf))
-    # A box in the image at T0 is the definition of T0.
+    # T0 is defined by a box in its image, so such a box is not early.
     return early_s if early_s > SLACK_S else 0.0
 
 
@@ -183,8 +183,8 @@ class OcSortRecovery:
     In `coasting` it counts as long as the tracker keeps it, up to 3 s after its last box at 10 Hz, at the
     position predicted by the filter. This is the most that recovery by a motion model can do for a hidden
     vehicle, and more than the authors return. Before T0 neither variant can raise an alarm for a vehicle that
-    was never detected, which is the paper's 0. On a hazard-free recording both report vehicles in view, and
-    `coasting` also those that have just left it.
+    was never detected, so the paper's value is 0. On a hazard-free recording both report vehicles in view,
+    and `coasting` also those that have just left it.
     """
 
     reading: Reading

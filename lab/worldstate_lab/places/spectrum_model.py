@@ -174,7 +174,7 @@ PARTS_M = (-1.3, 0.0, 1.3)
 # share r_0^2. They were set on 40 simulated passes (the 90 % interval covers 0.89) and on real ones without
 # positions. With 6 and 0.35 the error is 0.3 m smaller in simulation and 0.3 m larger on the real ones.
 FREEDOM, CHANCE = 4.5, 0.3
-# Directions below this share of the total are ignored by the metric: noise of microphones and method.
+# The metric ignores directions below this share of the total, which contain noise of microphones and method.
 LEAST_RESOLVED = 1e-3
 # r = 1 would mean certainty.
 MOST_ALIKE = 0.999

@@ -160,7 +160,7 @@ _ROUNDS, _MINUTES = 200, 10_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Encounters:
-    """Replays, one per row; K vehicles, missing ones already past; lanes left, right."""
+    """Replays, one per row, with K vehicles; missing ones have already passed, and lanes are left, right."""
 
     recorded: IndexArray  # shape (n,): Number of the approach, or of a minute without vehicles
     corner_ahead_m: FloatArray  # shape (n,)

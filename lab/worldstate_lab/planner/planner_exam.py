@@ -243,7 +243,7 @@ def approaches_drawn(
 
 
 def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
-    """Return the threshold one step below the largest one without collisions; 0 (phantom) without one."""
+    """Return the largest threshold without collisions, less one step; 0 (the phantom) if there is none."""
     # A threshold without collisions in about 130 approaches may cause one elsewhere: one step is kept as a
     # margin.
     kept = 0.0

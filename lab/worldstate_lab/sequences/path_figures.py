@@ -40,7 +40,7 @@ class Heard:
     recordings: Sequence[CornerRecording]
     seen: Sequence[Trial]  # Trials with the camera, if there is one
     alone: Sequence[Trial]  # Trials with sound alone
-    followed: Sequence[Tracked | None]  # None without a camera, since no vehicle in view is known then
+    followed: Sequence[Tracked | None]  # None without a camera, because no vehicle in view is known
 
 
 def heard_every_way(chain: Chain, recording: CornerRecording) -> tuple[Trial, Trial, Tracked | None]:

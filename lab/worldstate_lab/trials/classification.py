@@ -61,13 +61,13 @@ def posteriors(trial: Trial, evidence: str) -> FloatArray:
 class Classifiers:
     """The published classifier, trained for each fold on the permitted windows; each training runs once."""
 
-    windows: FeatureTable | None  # Released, simulated or extracted windows; none of a test recording
+    windows: FeatureTable | None  # Released, simulated or extracted windows, without those of test recordings
     told: str = ""  # Their origin, for the report
     _trained: dict[tuple[str, ...], dict[str, AnySignature]] = field(default_factory=dict)
     _heard: dict[tuple[tuple[str, ...], str], Trial] = field(default_factory=dict)
 
     def trained_on(self, kind: TrainedOn) -> TrainedOn:
-        """Return the training data in use: without windows always the calibration recordings."""
+        """Return the training data in use: the calibration recordings if there are no windows."""
         return "calibration" if self.windows is None else kind
 
     def classify(

@@ -249,7 +249,7 @@ def _draw_probabilities(axes: "Axes", states: Sequence[WorldState]) -> None:
 
 
 def _probabilities(state: WorldState, sides: Sequence[str]) -> list[float]:
-    """Return the existence of the likeliest vehicle in view, and the risk of each side."""
+    """Return the existence probability of the likeliest vehicle in view, and the risk of each side."""
     in_view = [one.existence_probability for one in state.entities if one.moving and one.status != "hidden"]
     risks = {cue.direction: cue.risk for cue in state.cues if cue.risk is not None}
     return [max(in_view, default=0.0), *(risks.get(side, math.nan) for side in sides)]
@@ -380,7 +380,7 @@ def _wedge(
 ) -> None:
     from matplotlib.patches import Wedge
 
-    # Ahead is up: matplotlib's angles begin on the right and are left positive as well.
+    # Ahead is up in the figure. Angles of matplotlib begin on the right and are left positive as well.
     first, last = (math.degrees(azimuth) + 90.0 for azimuth in sector_rad)
     drawn = {"color": color, "alpha": min(alpha, 1.0), "lw": 0, **drawn}
     axes.add_patch(Wedge((0.0, 0.0), radius_m, first, last, **drawn))

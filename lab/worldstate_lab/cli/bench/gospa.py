@@ -1,8 +1,9 @@
 """`worldstate-lab bench gospa`: GOSPA on bearing of the world-state beside trackers, on streams.
 
-Streams kept by `worldstate model make` are followed hop by hop. Cut-off 60 degrees, p = 1, alpha = 2. Hidden
-vehicles come into view within five seconds; visible ones are in line of sight and in the image. Every method
-gives both. A tracker has no occlusion model: its tracks in the sector of the boxes are visible.
+Streams kept by `worldstate model make` are followed hop by hop. The cut-off is 60 degrees, with p = 1 and
+alpha = 2. Hidden vehicles come into view within five seconds; visible ones are in line of sight and in the
+image. Every method gives both. A tracker has no occlusion model: its tracks in the sector of the boxes are
+visible.
 
 example: worldstate-lab bench gospa streams/S??-*.npz --seconds 120
 """

@@ -2,9 +2,9 @@
 
 FOLDER has real recordings of a corner in the layout of `worldstate-lab sequences`. Streams in --streams have
 the array of --path; for `seven` they have all 56 microphones, which changes evidence, prominence and bearing
-but not levels and bands. Streams whose names begin alike belong to one renderer; a few junctions of each are
-enough, and the work grows with the square of their excerpts. Window evidence on streams that --model learned
-is too good.
+but not levels and bands. Streams whose names begin alike belong to one renderer. A few junctions of each
+renderer are enough, because the work grows with the square of the number of excerpts. Window evidence is too
+good on streams in the training of --model.
 
 Each row is one column: the squared energy distance of real junctions from one another, of the halves of one
 of them (chance), and of simulated junctions from real ones, with the ratio of the distances. --statistics

@@ -186,7 +186,7 @@ def _by(what: str, outcomes: Sequence[BoardOutcome]) -> dict[str, list[BoardOutc
 
 
 def counts(outcomes: Sequence[BoardOutcome]) -> Figures:
-    """Return the counts of a group: with an advisory, on the right side, with more hazard at the end."""
+    """Return the counts of a group: with an advisory, with the correct side, with more hazard at the end."""
     rises = _rises(outcomes)
     return {
         "count": len(outcomes),
@@ -208,7 +208,7 @@ def _rises(outcomes: Sequence[BoardOutcome]) -> FloatArray:
 
 
 def side_figures(outcomes: Sequence[BoardOutcome]) -> dict[str, Any]:
-    """Return the share of right sides, with exact intervals, and the mean recall of both sides."""
+    """Return the share of correct sides, with exact intervals, and the mean recall of both sides."""
     shares = {name: _share(_right(some), len(some)) for name, some in _by("side", outcomes).items()}
     whole = _share(_right(outcomes), len(outcomes))
     return {**whole, "balanced": _balanced([one["share"] for one in shares.values()]), "by_side": shares}

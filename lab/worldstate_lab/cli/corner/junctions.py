@@ -4,9 +4,9 @@ FOLDER has real recordings of a corner in the layout of `worldstate-lab sequence
 spectra of seven microphones, with the camera. All thresholds are set on the other junctions. The published
 classifier and the shipped ensemble are trained on the released windows in --features, without the recordings
 in --lists: first on every junction, then without the tested junction. The ensemble is trained on these real
-windows alone, because its simulated ones take hours. Sequence and filter are not part of it, because the
-sequence learned no real junction. "shipped scores" are those of the shipped model, which learned windows of
-every junction.
+windows alone, because simulating further windows takes hours. Sequence and filter are left out, because no
+real junction is in the training of the sequence. "shipped scores" are those of the shipped model, whose
+training contains windows of every junction.
 
 Each row has the announced approaches, the lead, alarms per hour, the hazard AUROC one and two seconds before
 T0, and the worst junction of each; --json has all of them by junction.

@@ -81,7 +81,7 @@ def junction_figure(
     `values` maps method and junction to a value; `worst` is "low" or "high", the worse end.
     """
     sites = sorted({site for one in values.values() for site in one})
-    # Side by side within the row of a junction, offset by at most 0.3 rows.
+    # Marks are side by side within the row of a junction, offset by at most 0.3 rows.
     offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else np.zeros(1)
 
     def draw(canvas: "Canvas") -> None:
