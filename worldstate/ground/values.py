@@ -32,7 +32,7 @@ CERTAIN_NATS = 20.0
 _TURN = 2.0 * math.pi
 NANOSECONDS_PER_SECOND = 1_000_000_000
 SECONDS_PER_HOUR = 3600.0
-# Signed 64 bits less one hour, because later times, such as the end of an advisory, are written too.
+# Limit of signed 64 bits less one hour, because later times, such as the end of an advisory, are written too.
 _MOST_NS = (1 << 63) - 3600 * NANOSECONDS_PER_SECOND
 
 
@@ -231,7 +231,7 @@ def nanoseconds(time_s: float) -> int:
 
 
 def integer_ns(name: str, value: object) -> int:
-    """Return a time stamp as a Python integer, within signed 64 bits with an hour to spare.
+    """Return a time stamp as a Python integer, at least one hour within the limits of signed 64 bits.
 
     Examples
     --------

@@ -339,8 +339,8 @@ class Measurement:
     domain: DomainVerdict | None = None
     kinds: ClassShares = ()
     sequence: SequenceReading | NotUsable | None = None
-    # Overlap is discounted within a source, and evidence is multiplied across sources. Two sources with one
-    # name would be treated as one that repeats itself.
+    # Overlap is discounted within a source, and evidence is multiplied across sources. Two sources with the
+    # same name would be treated as one source with overlapping evidence.
     source: str = "acoustic"
     fault: str | None = None
     further: tuple[CameraLook, ...] = field(default=(), metadata=ADDED)
@@ -356,7 +356,7 @@ class Measurement:
 
     @property
     def looks(self) -> tuple[CameraLook, ...]:
-        """All looks in the order of their sensors; among equals the measurement's own look is first."""
+        """All looks in the order of their sensors; for one sensor, the measurement's own look is first."""
         own = self.look or Look(self.source, self.stamp_ns, self.co_evidence)
         return tuple(sorted((CameraLook(own, self.sightings), *self.further), key=_BY_SENSOR))
 

@@ -176,7 +176,7 @@ def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
     )
 
 
-# As many trees as a model for a standing ego has, each as large as its largest.
+# The number of trees is that of a model for a standing ego, and each has the size of its largest tree.
 _ROUNDS, _LEAVES = sum(one.rounds for one in STANDING), max(one.leaves for one in STANDING)
 
 

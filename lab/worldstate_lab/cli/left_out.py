@@ -6,11 +6,11 @@ renderer is left out once: a window and a sequence model are trained on the stre
 
 Figures are compared at equal onsets: the threshold is the lowest with at most 30 onsets per hour (a moving
 ego: 40) in the left-out renderer's own hazard-free streams, without misleading traffic. The output has for
-each renderer: approaches detected and their lead, those in advisory in the last second before T0 and in the
-last hop, onsets per hour, Brier skill of the probabilities at 1, 2 and 3 s, the share of detected approaches
-whose first advisory has the side of the first vehicle (both sides at once excluded), and detections without a
-wall opposite. "learned alarm" is the threshold that the streams of the other two renderers set, which a user
-would have.
+each renderer: approaches detected and their lead; approaches in advisory in the last second before T0 and in
+the last hop; onsets per hour; Brier skill of the probabilities at 1, 2 and 3 s; the share of detected
+approaches whose first advisory has the side of the first vehicle (both sides at once excluded); and
+detections without a wall opposite. "learned alarm" is the threshold that the streams of the other two
+renderers set, which a user would have.
 
 Examples
 --------

@@ -83,7 +83,7 @@ def _draw_measure(
     axes: "Axes", tables: Mapping[str, list[FeatureTable]], sites: list[str], name: str, windows: str
 ) -> None:
     """Draw the middle 90 and 50 % and the median at each junction."""
-    # All simulated sets together, because one of ten windows per side and site is too noisy.
+    # All simulated sets are drawn together, because one set of ten windows per side and site is too noisy.
     for place, site in enumerate(sites):
         for shift, (origin, some) in zip((0.18, -0.18), tables.items(), strict=True):
             values = [_values(table, site, windows, name) for table in some]

@@ -158,7 +158,7 @@ class Score:
     def _false_onsets(self) -> tuple[int, float]:
         """Return the number of alarms and the hours of hazard-free time."""
         hours = float(self.counts["free_hops"].mean(axis=0).sum()) * _HOURS
-        # All seeds use the same hours: their mean is one count, not a count over S times the hours.
+        # All seeds use the same hours, so their mean is one count and not a count over S times the hours.
         return round(float(self.counts["free_onsets"].mean(axis=0).sum())), hours
 
     def by_site(self) -> dict[str, dict[str, float]]:

@@ -77,7 +77,8 @@ def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod
     ensemble = WindowMethod(
         partial(_site_ensemble, simulated=simulated), fit=partial(trained_ensemble, simulated=simulated)
     )
-    # The pattern only, for a moving ego: streets with a standing ego reduce its accuracy (lab/NOTES.md).
+    # For a moving ego only the pattern is used, because streets with a standing ego reduce its accuracy
+    # (lab/NOTES.md).
     distant = WindowMethod(_distant_site, afar=True)
     return {
         "baseline": WindowMethod(PublishedClassifier),

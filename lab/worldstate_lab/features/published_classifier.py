@@ -149,7 +149,7 @@ class PublishedClassifier:
                 decisions[test] = 1.0 if is_first[train].all() else -1.0
                 continue
             machine = SVC(kernel="linear").fit(standard[train], is_first[train])
-            # Computed directly: scikit-learn's input check takes as long as the fit.
+            # The product is computed directly, because scikit-learn's input check takes as long as the fit.
             decisions[test] = standard[test] @ machine.coef_[0] + machine.intercept_[0]
         return decisions
 

@@ -99,7 +99,7 @@ def _seen(trial: Trial) -> Decisions:
     if len(boxes):
         moving = np.flatnonzero(boxes.moving)
         widths = boxes.box_px[moving, 2] - boxes.box_px[moving, 0]
-        # In order of width, so that the widest box of an image is kept.
+        # Boxes are in order of width, so that the widest box of an image is kept.
         chosen = moving[np.argsort(widths, kind="stable")]
         azimuth[boxes.frame[chosen]] = boxes.azimuth_rad[chosen]
     bearing = images.at_hops(azimuth)
@@ -212,7 +212,7 @@ class OcSortRecovery:
                 azimuth = float(self.camera.azimuth(0.5 * (left + right)))
                 rows.append((hop, one.track, azimuth, (right - left) * (bottom - top)))
         bearing = np.full(len(time_s), np.nan)
-        # In order of area, so that the largest box of a hop is kept.
+        # Boxes are in order of area, so that the largest box of a hop is kept.
         for hop, _, azimuth_rad, _ in sorted(rows, key=lambda row: row[3]):
             bearing[hop] = azimuth_rad
         tracks = HopTable.of_rows(TRACK_COLUMNS, [(time_s[hop], track, at) for hop, track, at, _ in rows])

@@ -30,7 +30,7 @@ from worldstate.operations.training.training import recording_labels
 DRAWS = 500
 _TAIL = (1.0 - 0.95) / 2.0
 
-# By recording, as in the paper.
+# Folds are by recording, as in the paper.
 FOLDS = 5
 
 Interval = tuple[float, float]
@@ -129,8 +129,9 @@ def random_detection(
 
     .. math:: \sum_i t_i \left(1 - (1 - w_i / T)^N\right) / \sum_i t_i
 
-    `windows_s` (n,) is w, the time before each T0 in which an onset counts; T is all scored time. For samples
-    of the approaches that contain each of them `times` (D, n), `alarms` and `scored_s` have shape (D,).
+    `windows_s` (n,) is w, the time before each T0 in which an onset counts; T is all scored time. For D
+    samples of the approaches, `times` (D, n) is how often a sample contains each approach, and `alarms` and
+    `scored_s` have shape (D,).
 
     Examples
     --------

@@ -391,7 +391,7 @@ def reach_on_data(
 
 def reach_on_table(table: FeatureTable, method: str, rng: np.random.Generator) -> ReachOnData:
     """Bound the error of any classifier on a table's windows, and add a method's out-of-fold error."""
-    # With curated references, as prepared.
+    # The table is prepared with curated references.
     chosen = method_of(method)
     posteriors = replace(chosen, reference=None).posteriors(chosen.prepare(table), rng)
     states = np.array([CLASSES.index(label) for label in table.labels.tolist()])

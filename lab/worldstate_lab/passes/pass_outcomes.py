@@ -8,10 +8,10 @@ Masking between vehicles is computed in the band 300 Hz to 2 kHz over half a sec
 beside others of power p1 adds 10 log10(1 + p2 / (p1 + background)) decibels; the background is the 20 %
 quantile of the level over the stream's hops.
 
-For the second vehicle of an approach, while the first is in view or has just left, the hops from the first T0
-to the second T0 are used, on the second vehicle's side. They are compared with hops of sides without a second
-vehicle at the same time after the first T0. These are distributed over the groups in proportion to the hops
-with a second vehicle at that time, so that every group has the base rate of the street.
+The second vehicle of an approach is evaluated on its own side, at the hops from the first T0 to the second
+T0, while the first vehicle is in view or has just left. These hops are compared with hops of sides without a
+second vehicle at the same time after the first T0. The latter are distributed over the groups in proportion
+to the hops with a second vehicle at that time, so that every group has the base rate of the street.
 """
 
 import math

@@ -180,7 +180,7 @@ LEAST_RESOLVED = 1e-3
 MOST_ALIKE = 0.999
 # Constant weights of direct, diffracted and singly reflected rays in the simple likelihood.
 DIRECT, BENT, REFLECTED = 1.0, 0.5, 0.5
-# Nats between a ray at the peak and one at the lowest level. Of 2, 4, 8 and 16, the value with the smallest
+# Nats between a ray at the peak and one at the lowest level: of 2, 4, 8 and 16, the value with the smallest
 # error on the simulated passes on which the constants above were set.
 SHARPNESS = 16.0
 _ARRIVALS_RAD = np.radians(np.arange(-90.0, 90.5, 1.0))

@@ -141,8 +141,8 @@ class EgoVehicle:
         return np.asarray(rising + np.maximum(way - until_m, 0.0) / self.limit_mps)
 
 
-# Position at which the states were recorded: the bumper is two metres ahead of an array at about this
-# distance.
+# The drive starts where the states were recorded: at about this distance before the line, the bumper is two
+# metres ahead of the array.
 FROM_STANDING = EgoVehicle(begins_m=3.5, begins_mps=0.0)
 
 
@@ -239,7 +239,7 @@ def empty_encounters(streams: Sequence[BelievedStream], count: int, rng: np.rand
 
 
 def _meets_s(stream: BelievedStream, one: StreamApproach, ego: EgoVehicle) -> float:
-    """Return when an ego that never brakes must start to meet the first vehicle of an approach."""
+    """Return the start time at which an ego that never brakes meets the first vehicle of an approach."""
     first = min(stream.ways, key=lambda way: abs(way.entry_s - one.entries_s[0]))
     middle_s = float(np.interp(0.0, -first.to_come_m - 0.5 * first.length_m, first.time_s))
     near_m, lane_m = stream.site.lanes_m[0], stream.site.lanes_m[first.side]

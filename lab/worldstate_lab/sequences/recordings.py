@@ -75,7 +75,7 @@ class CornerRecording:
         return self.folder / "video" / f"{self.name}.mp4"
 
     def cut(self, start_s: float) -> "CornerRecording":
-        """Return the recording without this much of its start, in whole tenths of a second."""
+        """Return the recording with this length cut off at its start, in whole tenths of a second."""
         t0_s, length_s = self.t0_s - start_s, self.length_s - start_s
         return replace(self, start_s=self.start_s + start_s, t0_s=t0_s, length_s=length_s)
 

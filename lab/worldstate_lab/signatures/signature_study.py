@@ -86,8 +86,8 @@ def _folds(table: ClipSignatures, rng: np.random.Generator) -> IndexArray:
     held = [
         (table.motor[of_clip == i].any(), table.background[of_clip == i].any()) for i in range(len(names))
     ]
-    # Background only, both, vehicles only, neither: recordings of one class are adjacent, so two of them are
-    # never in the same fold.
+    # The order is background only, both, vehicles only, neither: recordings of one class are adjacent, so two
+    # of them are never in the same fold.
     place = {(False, True): 0, (True, True): 1, (True, False): 2, (False, False): 3}
     draws = rng.random(len(names))
     order = sorted(range(len(names)), key=lambda i: (place[bool(held[i][0]), bool(held[i][1])], draws[i]))
@@ -154,8 +154,8 @@ VEHICLE = "vehicle"
 ELECTRIC = "electric"
 QUIET = (ELECTRIC, "bicycle", "tram")
 NOWHERE = "neither corpus labels electric cars"
-# Section IX of the paper. It gives one range for the shape without stating which end belongs to which
-# microphone.
+# Values of section IX of the paper, which gives one range for the shape without stating which end belongs to
+# which microphone.
 PAPER = {
     ("level", "studio"): (0.999, 0.999),
     ("level", "mems"): (0.997, 0.997),

@@ -77,7 +77,7 @@ class Classifiers:
         key = self._key(kind, calibration, tested, seed)
         if key not in self._trained:
             table = self._table(kind, calibration, tested)
-            # By name of their evidence: the classifier of the paper, and the ensemble that this library
+            # The keys are names of evidence: the classifier of the paper, and the ensemble that this library
             # ships, both trained on the same windows.
             published = PublishedClassifier(np.random.default_rng(seed))
             self._trained[key] = {
@@ -226,8 +226,8 @@ def windows_from_simulation(
             per_approach, apart, sites=sites, jobs=jobs, levels=levels, progress=progress
         )
         write_features(path, windows)
-    # Rendered at a quarter of the rate but with the bins of the full rate: the feature is that of OVAD's
-    # array.
+    # The sound is rendered at a quarter of the rate but with the bins of the full rate, so the feature is
+    # that of OVAD's array.
     table = replace(read_features(path), domain=ovad_domain(sites))
     return table, f"{len(table)} simulated windows of the same junctions, other recordings"
 

@@ -283,7 +283,8 @@ def widest_moving(boxes: HopTable) -> list[tuple[float, int, float, bool]]:
 
 def reference_rad(frame: AcousticFrame, vision: VisionQuery) -> float:
     """Return the azimuth of the moving box nearest to the acoustic bearing, NaN if there is none."""
-    # Half a camera period later: the image nearest in time to the centre of the bearing's window.
+    # Half a camera period is added, so that the latest image is the one nearest in time to the centre of the
+    # bearing's window.
     stamp = nanoseconds(seconds(frame.stamp_ns) - frame.bearing_age_s + 0.5 * HOP_S)
     moving = [seen.azimuth_rad for seen in vision.sightings(stamp) if seen.moving]
     return min(moving, key=lambda azimuth: abs(azimuth - frame.bearing_rad), default=np.nan)

@@ -126,7 +126,7 @@ class LivePage:
                 await asyncio.wait(self._feeds, timeout=_PATIENCE_S)
 
     def _answer(self, viewer: "ServerConnection", request: "Request") -> "Response | None":
-        """Answer a request for the page; leave that of the websocket to the server."""
+        """Answer a request for the page; the server answers a request for the websocket."""
         if request.path == STATES:
             return None
         if request.path != "/":

@@ -225,7 +225,7 @@ def _balanced(by_side: Sequence[float]) -> float | None:
 
 
 def hazard_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> dict[str, Any]:
-    """Return the mean over recordings of the area of the last seconds against the first."""
+    """Return the mean over recordings of the AUROC of the last seconds against the first."""
     known = [one for one in outcomes if one.rise is not None]
     rises = _rises(known)
     by_side = {name: float(_rises(some).mean()) for name, some in _by("side", known).items()}

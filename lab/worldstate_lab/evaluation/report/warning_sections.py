@@ -25,7 +25,8 @@ _WARNING = (
 _AREAS = ("auroc_all", "auroc_2s", "auroc_1s")
 _CALIBRATION = (*_AREAS, "ece", "ece_floor", "ece_raw", "brier_skill", "hazard_share")
 _TRACKING = ("gospa_deg", "visible_error_s", "visible_error_constant_s", "visible_coverage")
-# By condition of the paper's section VIII: clear is after T0 with the vehicle in view, occluded is before T0.
+# Figures by condition of the paper's section VIII: clear is after T0 with the vehicle in view, occluded is
+# before T0.
 _STRATA = ("hazard_awareness", "bearing_deg", "detection", "random_detection", *_AREAS)
 _BUDGET = ("false_alarms_per_hour", "detection", "random_detection", "lead_s")
 _PAIRS = (
