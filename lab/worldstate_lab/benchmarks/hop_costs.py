@@ -3,9 +3,9 @@
 Every stage is timed in place: its function is wrapped with a clock, so that the chain is not repeated here.
 The window model is the shipped one. Trees and guard are random, with the sizes that `worldstate model make`
 trains, because their time does not depend on the training. `published_chain` implements the published
-acoustic baseline in its amortised form: scipy's STFT of the whole file, channel by channel, with its time
-shared among the hops; then, for every hop, two segments of half a second through pyroomacoustics' SRP with
-thirty azimuths, 50-1500 Hz.
+acoustic baseline in its amortised form. It computes scipy's STFT of the whole file, channel by channel, and
+its time is shared among the hops. For every hop it then computes two segments of half a second by
+pyroomacoustics' SRP with thirty azimuths, 50-1500 Hz.
 """
 
 import time

@@ -1,9 +1,9 @@
 """`worldstate-lab table`: every row of Table I on a data set, as one report.
 
 Every recording is processed once, and every method decides on it: vision alone, radar, track recovery, the
-published acoustic classifier, the proposed method at three budgets, and this library's own advisory. Fits use
-other recordings than scores: five folds, one junction left out with the classifier fixed, and with the
-classifier retrained without it.
+published acoustic classifier, the proposed method at three budgets, and this library's own advisory. Methods
+are fitted on other recordings than those on which they are scored: with five folds, with one junction left
+out and a fixed classifier, and with one junction left out and a classifier retrained without it.
 
 DATASET is a folder in OVAD's layout: the real data set, or recordings of your own with DataLog.csv. Without
 one, streets are simulated into OUT/streets (12 GB), and the report states it. The tested recordings are those

@@ -308,7 +308,8 @@ def draw_figures(
     table: FeatureTable, passes: Sequence[Predictions], samples: Sequence[IndexArray]
 ) -> dict[str, FloatArray]:
     """Return the figures on every bootstrap sample of recordings, mean over the passes (seeds)."""
-    # The mean ECE of bootstrap samples is larger than that of the sample: use its interval as a width.
+    # The mean ECE of bootstrap samples is larger than that of the sample, so only the width of its interval
+    # is meaningful.
     measures = [_figures_on(table, one) for one in passes]
     found = [[measure(rows) for rows in samples] for measure in measures]
     draws = {name: [[one[name] for one in mine] for mine in found] for name in found[0][0]}

@@ -192,7 +192,7 @@ def evaluate_pass(
     rng, inputs = np.random.default_rng(seed), method.prepare(table)
     ask = _asked_plainly(inputs)
     if method.reference is not None:
-        # A separate generator: the folds of a seed are the same with every reference.
+        # A separate generator is used, so that the folds of a seed are the same with every reference.
         ask = _of_ensemble(asked_under(method.reference, table, np.random.default_rng([seed, 1])))
     if train is None:
         return cross_validate(inputs, protocol, method, rng, alpha=alpha, ask=ask)

@@ -3,7 +3,7 @@
 Time without a vehicle coming into view, and bets on the published chances, are cut into blocks of six
 minutes. A day consists of blocks drawn with replacement. For a higher onset rate, a Poisson number of blocks
 is superimposed, so that the clusters of onsets are preserved. The watch processes each day as in operation.
-For onsets, all hours are quiet time.
+Days of onsets consist of quiet time only.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -241,7 +241,7 @@ class SpectrumModel:
         frequencies = finite_array("frequencies_hz", frequencies_hz, (None,))
         along = np.arange(-FARTHEST_M, FARTHEST_M + 0.5 * STEP_M, STEP_M)
         beams = _responses(array, frequencies, azimuths, _ARRIVALS_RAD)
-        # All frequencies in one matrix product: separate products took 12 s instead of 1.
+        # All frequencies are in one matrix product: separate products took 12 s instead of 1.
         beams = np.ascontiguousarray(beams.transpose(0, 2, 1)).reshape(-1, len(azimuths)) / len(frequencies)
         diffuse = _responses(array, frequencies, azimuths, _ALL_ROUND_RAD).mean(axis=2) / len(frequencies)
         metric = _metric(_responses(array, frequencies, azimuths, azimuths).mean(axis=0))

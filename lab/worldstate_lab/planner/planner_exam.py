@@ -381,7 +381,7 @@ def _draw_corner(
 
 
 def _draw_speeds(axes: "Axes", empty: Encounters, planners: Mapping[str, CornerDrives]) -> None:
-    # The corner at which the planner with the chances brakes for the median time: a typical one.
+    # A typical corner is drawn: the one at which the planner with the chances brakes for the median time.
     braking = planners[CHANCE].empty.braking_s
     i = int(np.abs(braking - np.median(braking)).argmin())
     for name, told in (*_TOLD.items(), (CHANCE, "chance of the state")):
