@@ -60,14 +60,14 @@ def test_the_requested_budget_is_printed_beside_that_of_the_curve() -> None:
     world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02))
     promise = AlarmPromise(24.7, 9.1, 53.6, 0.0094, 0.0034, 0.0203)
     for alarm, words in (
-        (SequenceAlarm(1.0, 20.0), "20 onsets an hour; the model file has no curve"),
+        (SequenceAlarm(1.0, 20.0), "20 onsets per hour; the model file has no curve"),
         (
             SequenceAlarm(1.0, 25.0, None, promise),
-            "25 onsets an hour asked; promised are 24.7 an hour (9.1 to 53.6 at other junctions) and 0.9%",
+            "25 onsets per hour requested; the curve predicts 24.7 per hour (9.1 to 53.6 at other junctions) and 0.9%",
         ),
         (
             SequenceAlarm(1.0, 24.7, 0.01, promise),
-            "1.00% of the time without hazards asked; promised are 24.7",
+            "1.00% of the time without hazards requested; the curve predicts 24.7",
         ),
     ):
         said = SequenceReading(np.stack([heard(0.1), heard(0.01)]), SHARE, 0.2, alarm)
@@ -82,13 +82,13 @@ def test_low_recall_of_bicycles_is_printed() -> None:
     kinds = {"bicycle": 0.0, "car": 0.8}
     hop = Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, heard=Heard(0.5, "wind", kinds=kinds))
     lines = list(common_lines(WorldFilter().update(hop).state))
-    assert "heard by acoustic, by kind (simulated exam): bicycle 0.00, car 0.40" in lines
+    assert "acoustic, detected by kind (simulated exam): bicycle 0.00, car 0.40" in lines
 
 
 PRINTED = """\
 time  {now[time_s]:.2f} s
 left: advisory {standing}
-  usable: no, uncalibrated: no budget of false alarms was measured for what decides
+  usable: no, uncalibrated: no budget of false alarms was measured for this alarm
 {foreign}  since {since_s:.2f} s, valid until {until_s:.2f} s, rests on acoustic ({ear}), camera (working)
   log-odds that a vehicle comes into view within 3 s, nats:
     at, s                     {since_s:.2f}          {now[time_s]:.2f}
@@ -96,8 +96,8 @@ left: advisory {standing}
     sequence                 {onset[sequence]:+.2f}         {now[sequence]:+.2f}
     looks                    {onset[looks]:+.2f}         {now[looks]:+.2f}
     together                 {onset[together]:+.2f}         {now[together]:+.2f}
-    mean of .3 s             {onset[compared]:+.2f}         {now[compared]:+.2f}
-  side: {cue.confidence:.2f} of what is hidden; risk {cue.risk:.2f}
+    mean over 0.3 s          {onset[compared]:+.2f}         {now[compared]:+.2f}
+  side: {cue.confidence:.2f} of P(hidden); risk {cue.risk:.2f}
   comes into view: {within}; {interval_s[1]:.1f} s from now ({interval_s[0]:.1f} to {interval_s[2]:.1f})
   entity: {id:.8} hidden at {azimuth_deg:+.0f} deg (std {std_deg:.0f}), exists with {exists:.2f}, \
 by acoustic; the last look did not find it
@@ -109,7 +109,7 @@ HELD = {
     "standing": "held",
     "ear": "impaired",
     "foreign": "  usable: no, unknown sound: the model was not made for this sound\n",
-    "sound": "sound: sounds like speech: the evidence of this hop counts little\n"
+    "sound": "sound: sounds like speech: the evidence of this hop has little weight\n"
     "sensor acoustic: impaired (sounds like speech)\n",
 }
 

@@ -19,12 +19,12 @@ _SAID = {
 }
 _SAME_NS = 50_000_000  # half a hop
 WHY_NOT: dict[WhyNot, str] = {
-    "uncalibrated": "no budget of false alarms was measured for what decides",
-    "unheard": "no source that listens can hear",
+    "uncalibrated": "no budget of false alarms was measured for this alarm",
+    "unheard": "the sound is not usable",
     "unknown sound": "the model was not made for this sound",
     "too little sound": "less than a second of sound so far",
-    "budget broken": "a camera finds more false alarms, or other chances, than stated",
-    "expired": "nothing was measured for a second",
+    "budget broken": "a camera contradicts the stated rate of false alarms or the probabilities",
+    "expired": "no measurement for a second",
     "masked": "a vehicle in view covers the sound",
 }
 _OF = {
@@ -126,7 +126,7 @@ class SideEvidenceReport:
             yield f"  although the risk is high: {cue.not_advised}"
         yield from self._terms(now_s)
         if cue.confidence is not None and cue.risk is not None:
-            yield f"  side: {cue.confidence:.2f} of what is hidden; risk {cue.risk:.2f}"
+            yield f"  side: {cue.confidence:.2f} of P(hidden); risk {cue.risk:.2f}"
         if cue.within is not None:
             chances = ", ".join(f"{chance:.2f} in {after_s} s" for after_s, chance in cue.within.items())
             yield f"  comes into view: {chances}{_time(cue)}"
@@ -145,7 +145,7 @@ class SideEvidenceReport:
         yield from (_row(name, *(one.terms_nats.get(name, 0.0) for one in both)) for name in names)
         yield _row("together", *(sum(one.terms_nats.values()) for one in both))
         if evidence.hypothesis == "coming":
-            yield _row("mean of .3 s", *(one.compared_nats for one in both))
+            yield _row("mean over 0.3 s", *(one.compared_nats for one in both))
         if self.calibrated:
             yield _row("threshold", *(one.threshold_nats for one in both))
 
@@ -176,7 +176,7 @@ def common_lines(state: WorldState) -> Iterator[str]:
     if state.calibrated and state.budget is not None:
         yield f"budget: {_promised(state.budget)}"
     if isinstance(state.domain, Foreign):
-        yield f"sound: {state.domain.reason}: the evidence of this hop counts little"
+        yield f"sound: {state.domain.reason}: the evidence of this hop has little weight"
     elif isinstance(state.domain, WarningSignal):
         yield f"sound: a warning signal ({state.domain.signal})"
     if state.no_sequence is not None:
@@ -184,10 +184,10 @@ def common_lines(state: WorldState) -> Iterator[str]:
     for hearing in state.heard or ():
         if hearing.reason is not None:
             since = f"{hearing.reason} since {seconds(hearing.since_ns):.2f} s"
-            yield f"heard by {hearing.sensor}: {hearing.share:.2f} of hidden vehicles would be, {since}"
+            yield f"{hearing.sensor}: {hearing.share:.2f} of hidden vehicles would be detected, {since}"
         if hearing.kinds is not None:
             kinds = ", ".join(f"{kind} {share:.2f}" for kind, share in hearing.kinds.items())
-            yield f"heard by {hearing.sensor}, by kind (simulated exam): {kinds}"
+            yield f"{hearing.sensor}, detected by kind (simulated exam): {kinds}"
     for one in state.sensors:
         yield f"sensor {one.sensor}: {one.condition}{f' ({one.reason})' if one.reason else ''}"
     for view in state.searched:
@@ -199,14 +199,14 @@ def common_lines(state: WorldState) -> Iterator[str]:
 
 def _promised(budget: Budget) -> str:
     """Return the requested budget of the alarm, and the rates that its curve predicts for it."""
-    asked, promise = f"{budget.onsets_per_hour:g} onsets an hour", budget.promise
+    asked, promise = f"{budget.onsets_per_hour:g} onsets per hour", budget.promise
     if budget.asked_alpha is not None:
         asked = f"{budget.asked_alpha:.2%} of the time without hazards"
     if promise is None:
-        return f"{asked}; the model file has no curve of what other budgets cost"
+        return f"{asked}; the model file has no curve for other budgets"
     between = f"{promise.onsets_low:.1f} to {promise.onsets_high:.1f} at other junctions"
-    promised = f"{promise.onsets_per_hour:.1f} an hour ({between}) and {promise.alpha:.1%} of the time"
-    return f"{asked} asked; promised are {promised}"
+    promised = f"{promise.onsets_per_hour:.1f} per hour ({between}) and {promise.alpha:.1%} of the time"
+    return f"{asked} requested; the curve predicts {promised}"
 
 
 def _row(name: str, *nats: float) -> str:
