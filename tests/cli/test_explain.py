@@ -63,7 +63,8 @@ def test_the_requested_budget_is_printed_beside_that_of_the_curve() -> None:
         (SequenceAlarm(1.0, 20.0), "20 onsets per hour; the model file has no curve"),
         (
             SequenceAlarm(1.0, 25.0, None, promise),
-            "25 onsets per hour requested; the curve predicts 24.7 per hour (9.1 to 53.6 at other junctions) and 0.9%",
+            "25 onsets per hour requested; the curve predicts 24.7 per hour "
+            "(9.1 to 53.6 at other junctions) and 0.9%",
         ),
         (
             SequenceAlarm(1.0, 24.7, 0.01, promise),
