@@ -150,7 +150,7 @@ class Listener:
     >>> import numpy as np
     >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (57_600, 56))
     >>> listener = Listener(ovad_array(), 48_000)
-    >>> [state.stamp_ns / 1e9 for block in np.split(noise, 100) for state in listener.push(block)]
+    >>> [state.time_s for block in np.split(noise, 100) for state in listener.push(block)]
     [1.0, 1.1, 1.2]
     """
 
@@ -274,7 +274,7 @@ class Listener:
         >>> listener = Listener(ovad_array(), 48_000)
         >>> before = listener.push(np.zeros((48_000, 56)))
         >>> listener.skip(2_000_000_000)
-        >>> [state.stamp_ns / 1e9 for state in listener.push(np.zeros((4_800, 56)))]
+        >>> [state.time_s for state in listener.push(np.zeros((4_800, 56)))]
         [3.1]
         """
         self._adapter.front_end.skip(lost_ns)
@@ -480,7 +480,7 @@ def listen(source: Source) -> Iterator[WorldState]:
     >>> noise = np.random.default_rng(0).uniform(-0.01, 0.01, (19_200, 7))
     >>> with TemporaryDirectory() as folder:
     ...     soundfile.write(f"{folder}/noise.wav", noise, 16_000)
-    ...     [state.stamp_ns / 1e9 for state in listen(f"{folder}/noise.wav", "uma-8")]
+    ...     [state.time_s for state in listen(f"{folder}/noise.wav", "uma-8")]
     [1.0, 1.1, 1.2]
     """
     steps = listen_steps(source)

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Polygon, Rectangle, Wedge
 from PIL import Image
 
+import worldstate
 from worldstate.adapters.datasets.ovad import TrueTrack, read_true_tracks
-from worldstate.adapters.state_log import read_log
 from worldstate.state import WorldState
 
 # A dark card with its own background can be read on light and on dark pages.
@@ -37,8 +37,8 @@ def picture(folder: Path, path: Path) -> None:
     (truth_file,) = (folder / "recording").rglob("truth.json")
     site = json.loads(truth_file.read_text("utf-8"))["settings"]["site"]
     (track,) = read_true_tracks(truth_file.parent)
-    states = [state for _, state in read_log(folder / "states.jsonl")]
-    shown = [state for state in states if FIRST_S <= state.stamp_ns / 1e9 <= LAST_S]
+    states = worldstate.read(folder / "states.jsonl")
+    shown = [state for state in states if FIRST_S <= state.time_s <= LAST_S]
     frames = [frame(state, shown, site, track) for state in shown]
     times_ms = [*[100] * (len(frames) - 1), HELD_MS]
     frames[0].save(
@@ -50,7 +50,7 @@ def frame(state: WorldState, shown: list[WorldState], site: dict, track: TrueTra
     """Draw the three panels at the time of one state."""
     figure = Figure((WIDTH_PX / DPI, HEIGHT_PX / DPI), DPI, facecolor=CARD)
     canvas = FigureCanvasAgg(figure)
-    time_s = state.stamp_ns / 1e9
+    time_s = state.time_s
     at = int(np.argmin(np.abs(track.time_s - time_s)))
     words, color = sentence(state, shown, track)
     figure.text(0.02, 0.95, f"{time_s:.1f} s", color=TEXT, size=16, weight="bold", va="center")
@@ -71,8 +71,8 @@ def sentence(state: WorldState, shown: list[WorldState], track: TrueTrack) -> tu
     """Return what the state means, in one sentence, and its colour."""
     raised = [one for one in shown if any(cue.advisory for cue in one.cues)]
     entry_s = float(track.time_s[track.in_view][0])
-    if state.stamp_ns / 1e9 >= entry_s:
-        early_s = entry_s - raised[0].stamp_ns / 1e9
+    if state.time_s >= entry_s:
+        early_s = entry_s - raised[0].time_s
         return f"The vehicle is in view, {early_s:.1f} s after the advisory began.", IN_VIEW
     sides = [f"{cue.direction} ({100 * cue.risk:.0f} %)" for cue in state.cues if cue.advisory]
     if sides:
@@ -160,7 +160,7 @@ def chart(axes: Axes, state: WorldState, shown: list[WorldState], track: TrueTra
         side.set_visible(False)
     axes.grid(axis="y", color=HOUSE, lw=0.7)
     past = [one for one in shown if one.stamp_ns <= state.stamp_ns]
-    time_s = [one.stamp_ns / 1e9 for one in past]
+    time_s = [one.time_s for one in past]
     own = "right" if track.azimuth_rad[0] < 0 else "left"
     risks = {cue.direction: [risk_of(one, cue.direction) for one in past] for cue in state.cues}
     highest = max(risks, key=lambda side: risks[side][-1])

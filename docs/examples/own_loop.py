@@ -175,7 +175,7 @@ def main() -> None:
             entities = ", ".join(
                 f"{e.status} at {math.degrees(e.azimuth_rad):+.0f} deg" for e in state.entities
             )
-            print(f"{state.stamp_ns / 1e9:4.1f} s  risk {state.risk:.2f}  {entities or '-'}")
+            print(f"{state.time_s:4.1f} s  risk {state.risk:.2f}  {entities or '-'}")
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         one_of("--side", arguments.side, [cue.direction for cue in state.cues if cue.direction])
     read = partial(read_state_near, arguments.states, anywhere=True)
     reports = evidence_report.evidence_report(state, read, arguments.side)
-    now_s = ground.seconds(state.stamp_ns)
+    now_s = state.time_s
     written = state.to_dict()
     common = {key: written[key] for key in ("sensors", "searched", "events", "domain", "no_sequence")}
     lines = [line for report in reports.values() for line in report.lines(now_s)]

@@ -83,6 +83,6 @@ def risk_table(target: str) -> Iterator[Callable[[WorldState], None]]:
             for cue in state.cues:
                 risk = None if cue.risk is None else round(cue.risk, 4)
                 stated = cue.direction, risk, cue.advisory is not None, cue.usable, "; ".join(cue.why_not)
-                table.writerow([state.stamp_ns / 1e9, *stated])
+                table.writerow([state.time_s, *stated])
 
         yield export

@@ -224,7 +224,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         for one in track(read_recordings(arguments.sequences), "recordings"):
             steps = list(chain.steps(one))
             real.append([step.measurement for step in steps])
-            before = [step for step in steps if seconds(step.state.stamp_ns) < one.t0_s - _SLACK_S]
+            before = [step for step in steps if step.state.time_s < one.t0_s - _SLACK_S]
             risks = {cue.direction: cue.risk or 0.0 for cue in before[-1].state.cues}
             if not one.hazard_free and max(risks.values()) >= _LIKELY:
                 wrong.append(risks[one.side] < max(risks.values()))

@@ -101,7 +101,7 @@ def _number(time_s: float) -> int:
 
 
 def _by_image(chain: Chain, recording: CornerRecording) -> dict[int, Step]:
-    return {_number(seconds(step.state.stamp_ns)): step for step in chain.steps(recording)}
+    return {_number(step.state.time_s): step for step in chain.steps(recording)}
 
 
 def _vehicle(boxes: HopTable, recording: CornerRecording) -> list[AzimuthBox]:
@@ -142,7 +142,7 @@ def _identity(steps: Mapping[int, Step], found: Sequence[Entity | None], recordi
 def _cue_rows(steps: Iterable[Step], recording: CornerRecording) -> Iterator[tuple[float, ...]]:
     """Yield the published values of both sides in the seconds before T0."""
     for step in steps:
-        before_s = recording.t0_s - seconds(step.state.stamp_ns)
+        before_s = recording.t0_s - step.state.time_s
         if SLACK_S < before_s <= STATED_S + SLACK_S:
             own, other = sorted(step.state.cues, key=lambda cue: cue.direction != recording.side)
             low_s, _, high_s = own.time_to_visible_s or (math.nan,) * 3

@@ -149,7 +149,7 @@ def tables_of_steps(name: str, steps: Iterable[Step]) -> dict[str, HopTable]:
         for entity in step.state.entities:
             if entity.moving and entity.existence_probability >= LIKELY:
                 number = identities.setdefault(entity.id, len(identities))
-                tracks.append((seconds(step.state.stamp_ns), number, entity.azimuth_rad))
+                tracks.append((step.state.time_s, number, entity.azimuth_rad))
     stream = hop_stream(measured, name=name)
     return {
         "decisions": HopTable.of_rows(DECISION_COLUMNS, rows),
@@ -222,7 +222,7 @@ def _decided(state: WorldState) -> tuple[Any, ...]:
     nats = max((cue.evidence.compared_nats for cue in state.cues if cue.evidence), default=np.nan)
     score = 1.0 / (1.0 + np.exp(-nats))
     side = SIDES.get(told.direction or "", NO_SIDE) if raised and told is not None else NO_SIDE
-    return seconds(state.stamp_ns), bool(raised), side, _bearing(state), score, state.risk, _visible(told)
+    return state.time_s, bool(raised), side, _bearing(state), score, state.risk, _visible(told)
 
 
 def _bearing(state: WorldState) -> float:

@@ -10,8 +10,6 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from worldstate import ground
-
 from .output import printable
 
 if TYPE_CHECKING:
@@ -48,7 +46,7 @@ def view_of(live: "LiveStep") -> RenderableType:
     state = live.step.state
     late = f"latency {1e3 * live.latency_s:.0f} ms"
     lost = f"{live.overruns} overruns, {live.lost_s:.2f} s lost"
-    head = Text(f"{ground.seconds(state.stamp_ns):9.1f} s   {late}   ")
+    head = Text(f"{state.time_s:9.1f} s   {late}   ")
     head.append(lost, style="red" if live.overruns else "green")
     return Group(head, _bearing(state), *map(_cue, state.cues), _entities(state.entities))
 

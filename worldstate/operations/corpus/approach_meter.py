@@ -60,10 +60,10 @@ class ApproachMeter:
         self._advise(state, raised, looked)
         for entity in state.entities:
             if entity.status == "visible" and entity.moving:
-                self._see(entity, seconds(state.stamp_ns))
+                self._see(entity, state.time_s)
 
     def _advise(self, state: WorldState, raised: list[RiskCue], looked: bool) -> None:
-        now_s, before, self._standing = seconds(state.stamp_ns), self._standing, {}
+        now_s, before, self._standing = state.time_s, self._standing, {}
         for cue in raised:
             at = before.get(cue.direction, len(self._rows))
             if at == len(self._rows):

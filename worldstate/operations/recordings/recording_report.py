@@ -85,7 +85,7 @@ class WarningMeter:
         self.reasons.update(why_not)
         raised = [cue for cue in state.cues if cue.advisory]
         if raised:
-            now_s, told = seconds(state.stamp_ns), max(raised, key=lambda cue: cue.risk or 0.0).entity_id
+            now_s, told = state.time_s, max(raised, key=lambda cue: cue.risk or 0.0).entity_id
             if not self._raised:
                 # The first advisory of a log may have begun before the log.
                 since_ns = min(cue.advisory.since_ns for cue in raised if cue.advisory is not None)
@@ -275,7 +275,7 @@ def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
     for state in states:
         raised = {cue.direction for cue in state.cues if cue.advisory and cue.direction}
         for side in raised - standing:
-            onsets.setdefault(side, []).append(seconds(state.stamp_ns))
+            onsets.setdefault(side, []).append(state.time_s)
         standing = raised
     return onsets
 

@@ -302,7 +302,7 @@ def page_row(state: WorldState) -> Row:
     bearing = state.bearing
     stated = [(one.direction, one.evidence) for one in state.cues if one.direction and one.evidence]
     return {
-        "t": round(seconds(state.stamp_ns), 3),
+        "t": round(state.time_s, 3),
         "sentence": headline(state),
         "entities": list(map(_entity, likeliest)),
         "cues": [_cue(one) for one in state.cues if one.direction is not None],

@@ -169,7 +169,7 @@ def _draw_truth(axes: "Axes", truth: Sequence[TrueTrack]) -> None:
 
 def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
     """Draw the 90 % interval of every entity's azimuth, and the measured bearings."""
-    heard = [(seconds(state.stamp_ns), state.bearing.azimuth_rad) for state in states if state.bearing]
+    heard = [(state.time_s, state.bearing.azimuth_rad) for state in states if state.bearing]
     if heard:
         time_s, azimuth_rad = np.array(heard).T
         axes.plot(time_s, np.degrees(azimuth_rad), ".", color=style.HEARD, ms=4, label="measured bearing")
@@ -178,7 +178,7 @@ def _draw_azimuths(axes: "Axes", states: Sequence[WorldState]) -> None:
         for one in (part for known in state.entities for part in known.on_each_side()):
             if one.moving and one.existence_probability >= _LIKELY:
                 sector = sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)
-                row = seconds(state.stamp_ns), *np.degrees([one.azimuth_rad, *sector]).tolist()
+                row = state.time_s, *np.degrees([one.azimuth_rad, *sector]).tolist()
                 tracks.setdefault((one.id, one.status == "hidden"), []).append(row)
     for (_, hidden), rows in tracks.items():
         color, label = (style.HIDDEN, "hidden entity") if hidden else (style.IN_VIEW, "entity in view")
@@ -236,11 +236,11 @@ def _decided(state: WorldState, side: str) -> tuple[float, float, float, bool]:
     else:
         compared, threshold = cue.evidence.compared_nats, cue.evidence.threshold_nats
     raised = cue is not None and cue.advisory is not None
-    return seconds(state.stamp_ns), compared, threshold if state.calibrated else math.nan, raised
+    return state.time_s, compared, threshold if state.calibrated else math.nan, raised
 
 
 def _draw_probabilities(axes: "Axes", states: Sequence[WorldState]) -> None:
-    rows = [(seconds(state.stamp_ns), *_probabilities(state, _sides(states))) for state in states]
+    rows = [(state.time_s, *_probabilities(state, _sides(states))) for state in states]
     time_s, in_view, *risks = style.with_gaps(np.array(rows)).T
     for side, dashes, risk in zip(_sides(states), style.SIDE_DASHES, risks, strict=False):
         axes.plot(time_s, risk, dashes, color=style.HIDDEN, label=f"risk, {side}")
@@ -266,7 +266,7 @@ def _uncalibrated(states: Sequence[WorldState]) -> str:
 
 
 def _times(states: Sequence[WorldState]) -> list[float]:
-    return [seconds(state.stamp_ns) for state in states]
+    return [state.time_s for state in states]
 
 
 def write_birds_eye(state: WorldState, path: Path, *, title: str = "") -> None:
@@ -328,7 +328,7 @@ def _draw(axes: "Axes", state: WorldState, title: str) -> None:
     behind = any(abs(view.sector_rad[0]) > 0.6 * math.pi for view in state.searched)
     axes.set(xlim=(-38, 38), ylim=(-41 if behind else -11, 37), aspect="equal", xticks=(), yticks=())
     axes.spines[:].set_visible(False)
-    words = f"{seconds(state.stamp_ns):.1f} s   {title}{_uncalibrated([state])}"
+    words = f"{state.time_s:.1f} s   {title}{_uncalibrated([state])}"
     axes.set_title(words, loc="left")
     _draw_legend(axes)
 
