@@ -67,6 +67,26 @@ from .own_parts import MOTION, OtherModality, detector_maker, other_modality
 
 _LOG = logging.getLogger(__name__)
 NO_STREET = "the model file holds no numbers of the belief: the shipped ones are used"
+RAW = "pcm:"
+_TOPICS = "audio", "detections", "odometry"
+_ALPHA = 0.02  # The paper's budget, for a model without a sequence
+# Sequence models were trained on bearings in the half plane ahead.
+_READ_SPAN_DEG = 180.0
+_SOUND_ONLY = f"The states hold bearings and tracks of sound, but no side, class or risk. {TRAIN}"
+# Assumed length of a stream or of microphones, whose end is not known.
+_ONE_DAY_S = 86_400.0
+# Closer time stamps have another unit, and so have stamps that begin with the sound and last this many times
+# longer.
+_SHORTEST_STEP_S, _MOST_LONGER = 5e-4, 100.0
+# Without a warning at least this share of the stamps is within the sound, and they cover at least this share
+# of it: for images with an assumed rate, with a stated rate, and with stamps of their own, because a camera
+# may stop earlier.
+_TOGETHER = 0.97, 0.9, 0.6
+# Offsets from UTC to TAI, from UTC to GPS and from GPS to TAI, between clocks that were set by different
+# sources.
+_TIME_SCALES_S, _SAME_S = (37.0, 18.0, 19.0), 1.0
+# Usual rates of slower cameras. Images may continue after the sound for less than a second.
+_SLOW_RATES_HZ, _SAME_LENGTH, _LONGER_S = (1.0, 2.0, 2.5, 5.0, 7.5), 0.03, 1.0
 T = TypeVar("T")
 Detections: TypeAlias = Path | str | DetectionLog
 
@@ -617,28 +637,6 @@ class SourceSensors:
         return {}, self.setup.detections or of_bag
 
 
-RAW = "pcm:"
-_TOPICS = "audio", "detections", "odometry"
-_ALPHA = 0.02  # The paper's budget, for a model without a sequence
-# Sequence models were trained on bearings in the half plane ahead.
-_READ_SPAN_DEG = 180.0
-_SOUND_ONLY = f"The states hold bearings and tracks of sound, but no side, class or risk. {TRAIN}"
-# Assumed length of a stream or of microphones, whose end is not known.
-_ONE_DAY_S = 86_400.0
-# Closer time stamps have another unit, and so have stamps that begin with the sound and last this many times
-# longer.
-_SHORTEST_STEP_S, _MOST_LONGER = 5e-4, 100.0
-# Without a warning at least this share of the stamps is within the sound, and they cover at least this share
-# of it: for images with an assumed rate, with a stated rate, and with stamps of their own, because a camera
-# may stop earlier.
-_TOGETHER = 0.97, 0.9, 0.6
-# Offsets from UTC to TAI, from UTC to GPS and from GPS to TAI, between clocks that were set by different
-# sources.
-_TIME_SCALES_S, _SAME_S = (37.0, 18.0, 19.0), 1.0
-# Usual rates of slower cameras. Images may continue after the sound for less than a second.
-_SLOW_RATES_HZ, _SAME_LENGTH, _LONGER_S = (1.0, 2.0, 2.5, 5.0, 7.5), 0.03, 1.0
-
-
 def check_clocks(source: Source, length_s: float | None) -> None:
     """Refuse time stamps on another clock than the sound, and images at another rate than was assumed.
 
@@ -675,11 +673,8 @@ def _check_stamps(
     A warning is logged if less than the share `least` of them lies within the sound, or covers it.
     """
     (begins_s, ends_s), first_s, last_s = sound_s, float(times_s[0]), float(times_s[-1])
-    length_s, span_s, within = (
-        ends_s - begins_s,
-        last_s - first_s,
-        (begins_s <= times_s) & (times_s <= ends_s),
-    )
+    length_s, span_s = ends_s - begins_s, last_s - first_s
+    within = (begins_s <= times_s) & (times_s <= ends_s)
     step_s, off_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 1.0, first_s - begins_s
     slow = abs(off_s) < _SAME_S < step_s and span_s > _MOST_LONGER * length_s
     if step_s < _SHORTEST_STEP_S or slow:
