@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -12,7 +11,6 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,13 +19,11 @@ import soundfile
 from rich.console import Console
 
 from worldstate.adapters.audio.sound_file import open_sound
-from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.live.live_listening import live_steps
 from worldstate.adapters.live.live_sound import LiveSound, Playback
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.common.live_view import view_of
 from worldstate.cli.main import main
-from worldstate.state import WorldState
 
 RATE = 8_000
 
@@ -104,32 +100,6 @@ def test_a_signal_ends_the_run_with_complete_files(street, tmp_path):
         printed, _ = process.communicate(timeout=60.0)
     assert process.returncode == 0
     assert json.loads(printed)["states"] == len(out.read_text().splitlines()) > 0
-
-
-def test_the_program_of_the_page_publishes_states(street, tmp_path, monkeypatch):
-    page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "live_details.md"
-    programs = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    program = next(one for one in programs if "ImageLooks" in one)
-    (tmp_path / "mics.csv").write_text((street / "mics.csv").read_text())
-    lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
-    (tmp_path / "camera.json").write_text(json.dumps(lens))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        "worldstate.adapters.live.live_sound.PortAudioInput",
-        lambda channels, sample_rate_hz: Playback(open_sound(street / "street.wav"), speed=2.0),
-    )
-    found = DetectionFrame(np.array([[260.0, 100.0, 380.0, 300.0]]), np.array([0.9]), ("car",))
-    published = []
-
-    def publish(line, latency_s):
-        published.append(WorldState.from_json(line))
-        given["on_image"](np.zeros((480, 640, 3), np.uint8))
-        assert latency_s > 0.0
-
-    given = {"publish": publish, "detector": SimpleNamespace(detect=lambda image: found)}
-    exec(compile(program, "live_details.md", "exec"), given)
-    assert len(published) == 10, "at 8 kHz the last hop waits for later sound"
-    assert [view.sensor for view in published[-1].searched] == ["camera"]
 
 
 class Capture:
