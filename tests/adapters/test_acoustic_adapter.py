@@ -1,167 +1,131 @@
-"""The acoustic adapter combines sound, camera and signature at one stamp."""
+"""The acoustic adapter combines sound, camera and signature at one stamp, with a guard and road users."""
 
-import math
+from collections.abc import Collection
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
+from camera_boxes import EMPTY, boxed
+from made_up_sound import Fixed, plane_wave
 
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.road_users import (
+    DomainGuard,
+    Familiar,
+    Foreign,
+    RoadUserModel,
+    WarningSignal,
+    expected_labels,
+    heard_kinds,
+)
 from worldstate.adapters import acoustic
-from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
+from worldstate.adapters.acoustic import FOREIGN, AcousticAdapter, asked_again
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
+from worldstate.belief.street_model import StreetModel
+from worldstate.belief.track import Tracks, heard_as
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.settings import FrontEndSettings
+from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
+from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.values import NotUsable, nanoseconds
-from worldstate.measurement.measurement import Approach, Bearing, Heard, Measurement, MeasurementAdapter
+from worldstate.measurement.measurement import Approach, Bearing, Heard, Measurement
+from worldstate.state.world_state import WorldState
 
 RATE_HZ = 16_000
-SPEED_OF_SOUND_M_S = 343.0
 ARRAY = MicrophoneArray(
     np.column_stack([np.zeros(12), np.linspace(0.4, -0.4, 12), np.tile([0.0, 0.1, 0.25], 4)])
 )
+wave = partial(plane_wave, ARRAY, RATE_HZ)
 
 
-class Level:
-    """A model with fixed hidden likelihoods and the mean of the feature as the none likelihood."""
-
-    def __init__(self, left: float = 0.0, right: float = 0.0) -> None:
-        self.hidden = (left, right)
-
-    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
-        return SignatureEvidence(("left", "right"), self.hidden, 0.0, float(np.mean(feature)))
+def measured(sound: np.ndarray, model: Fixed | None = None, **more: Any) -> list[Measurement]:
+    return AcousticAdapter(ARRAY, RATE_HZ, model or Fixed(), **more).measure(sound)
 
 
-def plane_wave(azimuth_rad: float, seconds: float, gain_per_s: float = 0.0, seed: int = 3) -> np.ndarray:
-    """Broadband sound from far away, shape (n, M), with a little noise of every microphone's own."""
-    rng = np.random.default_rng(seed)
-    n = int(seconds * RATE_HZ)
-    direction = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
-    advance_s = ARRAY.positions_m @ direction / SPEED_OF_SOUND_M_S
-    frequencies = np.fft.rfftfreq(n, 1 / RATE_HZ)
-    spectrum = np.fft.rfft(rng.standard_normal(n))
-    turns = np.exp(2j * np.pi * frequencies[:, None] * advance_s)
-    shifted = np.fft.irfft(spectrum[:, None] * turns, n, axis=0)
-    grows = np.exp(gain_per_s * np.arange(n) / RATE_HZ)[:, None]
-    return (0.05 * (shifted * grows + 0.05 * rng.standard_normal((n, 12)))).astype(np.float32)
-
-
-def camera_log(azimuth_rad: float | None) -> DetectionLog:
-    """Return boxes of a car that moves slightly around an azimuth, or empty images."""
-    frames = []
-    columns = [] if azimuth_rad is None else [float(PinholeCamera.ovad().column(azimuth_rad))]
-    for i in range(40):
-        boxes = [[c + 8.0 * (i % 3) - 60, 500, c + 8.0 * (i % 3) + 60, 650] for c in columns]
-        labels = ("car",) * len(boxes)
-        frames.append(DetectionFrame(np.array(boxes, float).reshape(-1, 4), np.full(len(boxes), 0.9), labels))
-    return DetectionLog.at_rate(frames, 10.0)
-
-
-def same(one: Measurement, other: Measurement) -> bool:
-    assert isinstance(one.bearing, Bearing)
-    assert isinstance(other.bearing, Bearing)
-    return (
-        one.stamp_ns == other.stamp_ns
-        and np.allclose(one.signature.log_likelihoods, other.signature.log_likelihoods, rtol=1e-5)
-        and math.isclose(one.bearing.azimuth_rad, other.bearing.azimuth_rad, rel_tol=1e-5, abs_tol=1e-6)
-    )
-
-
-def test_is_a_measurement_adapter() -> None:
-    adapter: MeasurementAdapter[np.ndarray] = AcousticAdapter(ARRAY, RATE_HZ, Level())
-    assert adapter.source == "acoustic"
-    assert adapter.measure(np.zeros((0, 12), np.float32)) == []
+def camera(azimuth_rad: float | None) -> VisionQuery:
+    """Return a camera with boxes of a car that moves slightly around an azimuth, or with empty images."""
+    frames = [EMPTY] * 40
+    if azimuth_rad is not None:
+        column = float(PinholeCamera.ovad().column(azimuth_rad))
+        lefts = [column - 60.0 + 8.0 * (i % 3) for i in range(40)]
+        frames = [boxed((left, 500.0, left + 120.0, 650.0)) for left in lefts]
+    return VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate(frames, 10.0))
 
 
 @pytest.mark.parametrize("start_ns", [0, 1_700_000_000_000_000_000])
 def test_a_measurement_every_hop_after_the_first_second(start_ns: int) -> None:
-    measured = AcousticAdapter(ARRAY, RATE_HZ, Level(), start_ns=start_ns).measure(plane_wave(0.3, 1.3))
-    assert [m.stamp_ns - start_ns for m in measured] == [nanoseconds(t) for t in (1.0, 1.1, 1.2, 1.3)]
-    assert all(m.source == "acoustic" for m in measured)
+    found = measured(wave(0.3, 1.3), start_ns=start_ns)
+    assert [m.stamp_ns - start_ns for m in found] == [nanoseconds(t) for t in (1.0, 1.1, 1.2, 1.3)]
+    assert all(m.source == "acoustic" for m in found)
 
 
 @pytest.mark.parametrize("azimuth_rad", [-0.5, 0.0, 0.5])
 def test_the_camera_is_queried_at_the_bearing(azimuth_rad: float) -> None:
-    sound = plane_wave(azimuth_rad, 1.5)
-    seen = VisionQuery(PinholeCamera.ovad(), camera_log(azimuth_rad))
-    empty = VisionQuery(PinholeCamera.ovad(), camera_log(None))
-    elsewhere = VisionQuery(PinholeCamera.ovad(), camera_log(-0.5 if azimuth_rad >= 0 else 0.5))
-    for vision, answer in ((seen, Present), (empty, Absent), (elsewhere, Absent)):
-        measured = AcousticAdapter(ARRAY, RATE_HZ, Level(), vision).measure(sound)
-        assert [type(m.co_evidence) for m in measured] == [answer] * 6
-        for m in measured:
+    elsewhere = -0.5 if azimuth_rad >= 0 else 0.5
+    for box_rad, answer in ((azimuth_rad, Present), (None, Absent), (elsewhere, Absent)):
+        found = measured(wave(azimuth_rad, 1.5), vision=camera(box_rad))
+        assert [type(m.co_evidence) for m in found] == [answer] * 6
+        for m in found:
             assert isinstance(m.bearing, Bearing)
             assert m.bearing.azimuth_rad == pytest.approx(azimuth_rad, abs=0.03)
-            assert len(m.sightings) == (vision is not empty)
-
-
-def test_a_bearing_outside_the_view_is_unqueried() -> None:
-    vision = VisionQuery(PinholeCamera.ovad(), camera_log(None))
-    answers = AcousticAdapter(ARRAY, RATE_HZ, Level(), vision).measure(plane_wave(1.1, 1.2))
-    assert {m.co_evidence for m in answers} == {Unqueried("sector outside the field of view")}
+            assert len(m.sightings) == (box_rad is not None)
 
 
 def test_a_coarse_bearing_takes_its_side_from_the_signature(monkeypatch: pytest.MonkeyPatch) -> None:
-    vision = VisionQuery(PinholeCamera.ovad(), camera_log(0.4))
     monkeypatch.setattr(acoustic, "_COARSE_STD_RAD", 0.0)
     # Two equally strong waves count as reflected sound, so the bearing has no vote.
-    sound = plane_wave(-0.3, 1.0) + plane_wave(-1.1, 1.0, seed=4)
-    for model, answer in ((Level(left=1.0), Present), (Level(right=1.0), Absent), (Level(), Present)):
-        (measured,) = AcousticAdapter(ARRAY, RATE_HZ, model, vision).measure(sound)
-        assert isinstance(measured.co_evidence, answer)
+    sound = wave(-0.3, 1.0) + wave(-1.1, 1.0, seed=4)
+    for model, answer in ((Fixed(1.0, 0.0), Present), (Fixed(0.0, 1.0), Absent), (Fixed(), Present)):
+        (found,) = measured(sound, model, vision=camera(0.4))
+        assert isinstance(found.co_evidence, answer)
 
 
 @pytest.mark.parametrize("azimuth_rad", [-1.0, -0.5, 0.5, 1.0])
 def test_direct_sound_has_the_side_of_its_bearing(azimuth_rad: float) -> None:
     """The model gives the wrong side for a source in line of sight."""
-    wrong = Level(right=5.0, left=-2.0) if azimuth_rad > 0 else Level(left=5.0, right=-2.0)
-    for measured in AcousticAdapter(ARRAY, RATE_HZ, wrong).measure(plane_wave(azimuth_rad, 1.3)):
-        left, right = measured.signature.hidden
+    wrong = Fixed(-2.0, 5.0) if azimuth_rad > 0 else Fixed(5.0, -2.0)
+    for found in measured(wave(azimuth_rad, 1.3), wrong):
+        left, right = found.signature.hidden
         assert (left - right) * azimuth_rad > 0.0
         # Direct sound is no evidence of a hidden vehicle.
         assert max(left, right) < 1.0
 
 
 def test_reflected_sound_has_the_side_of_the_signature() -> None:
-    sound = plane_wave(0.5, 1.3) + plane_wave(-0.7, 1.3, seed=4)
-    for measured in AcousticAdapter(ARRAY, RATE_HZ, Level(right=5.0, left=-2.0)).measure(sound):
-        assert measured.signature.hidden == (-2.0, 5.0)
+    for found in measured(wave(0.5, 1.3) + wave(-0.7, 1.3, seed=4), Fixed(-2.0, 5.0)):
+        assert found.signature.hidden == (-2.0, 5.0)
 
 
-def test_without_prominence_there_is_no_bearing() -> None:
-    adapter = AcousticAdapter(ARRAY, RATE_HZ, Level())
-    (frame,) = adapter.front_end.process(plane_wave(0.3, 1.0))
-    measured = adapter.interpret(replace(frame, least_prominence=1e6))
-    assert isinstance(measured.bearing, NotUsable)
-    assert "1000000.00" in measured.bearing.reason
-
-
-def test_silence_has_neither_bearing_nor_approach() -> None:
-    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(np.zeros((20_000, 12), np.float32))
-    assert measured
-    assert all(isinstance(m.bearing, NotUsable) and isinstance(m.approach, NotUsable) for m in measured)
+def test_without_a_prominent_peak_there_is_no_bearing() -> None:
+    adapter = AcousticAdapter(ARRAY, RATE_HZ, Fixed())
+    (frame,) = adapter.front_end.process(wave(0.3, 1.0))
+    bearing = adapter.interpret(replace(frame, least_prominence=1e6)).bearing
+    assert isinstance(bearing, NotUsable) and "1000000.00" in bearing.reason
+    silent = measured(np.zeros((20_000, 12), np.float32))
+    assert silent
+    assert all(isinstance(m.bearing, NotUsable) and isinstance(m.approach, NotUsable) for m in silent)
 
 
 def test_growing_sound_approaches() -> None:
     for gain_per_s in (0.8, -0.8):
-        measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(plane_wave(0.2, 2.0, gain_per_s))
-        rates = [m.approach.inverse_tta_hz for m in measured if isinstance(m.approach, Approach)]
-        assert len(rates) > 5
-        assert all(np.sign(rate) == np.sign(gain_per_s) for rate in rates)
+        sound = wave(0.2, 2.0) * np.exp(gain_per_s * np.arange(2 * RATE_HZ) / RATE_HZ)[:, None]
+        rates = [m.approach.inverse_tta_hz for m in measured(sound) if isinstance(m.approach, Approach)]
+        assert len(rates) > 5 and set(np.sign(rates)) == {np.sign(gain_per_s)}
 
 
 def test_microphone_faults_are_published() -> None:
-    sound = plane_wave(0.2, 1.3)
-    whole = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(sound)[-1]
+    sound = wave(0.2, 1.3)
+    assert measured(sound)[-1].fault is None
     sound[:, [2, 5]] = 0.0
-    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(sound)[-1]
-    assert (whole.fault, measured.fault) == (None, "microphones: 2 dead")
-    (told,) = WorldFilter().update(measured).state.sensors
-    assert (told.condition, told.reason) == ("impaired", measured.fault)
+    found = measured(sound)[-1]
+    (told,) = WorldFilter().update(found).state.sensors
+    assert (told.condition, told.reason) == ("impaired", found.fault) == ("impaired", "microphones: 2 dead")
 
 
 def heard_well(heard: Heard) -> bool:
@@ -184,14 +148,14 @@ def hurt(sound: np.ndarray, fault: str) -> np.ndarray:
     return sound
 
 
-@pytest.mark.parametrize(
-    "fault", ["lost samples", "dead channels", "wind", "noise", "noise that is the same in all"]
-)
+FAULTS = ["lost samples", "dead channels", "wind", "noise", "noise that is the same in all"]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
 def test_unusable_sound_has_its_reason_and_no_evidence(fault: str) -> None:
-    hurt_sound = hurt(plane_wave(0.3, 5.0), fault)
-    measured = AcousticAdapter(ARRAY, RATE_HZ, Level(left=3.0)).measure(hurt_sound)
-    unheard = [m for m in measured if not m.heard.usable]
-    covered = [m for m in measured if 2.65 < m.stamp_ns / 1e9 <= 3.501]
+    found = measured(hurt(wave(0.3, 5.0), fault), Fixed(3.0, 0.0))
+    unheard = [m for m in found if not m.heard.usable]
+    covered = [m for m in found if 2.65 < m.stamp_ns / 1e9 <= 3.501]
     assert all(m in unheard for m in covered)
     # A failed microphone stays masked for five more seconds.
     assert fault == "dead channels" or all(2.5 < m.stamp_ns / 1e9 < 4.05 for m in unheard)
@@ -200,31 +164,189 @@ def test_unusable_sound_has_its_reason_and_no_evidence(fault: str) -> None:
     for one in unheard:
         assert isinstance(one.bearing, NotUsable) and isinstance(one.approach, NotUsable)
         assert set(one.signature.log_likelihoods) == {0.0}
-    assert fault == "dead channels" or heard_well(measured[-1].heard)
-    assert all(heard_well(m.heard) for m in measured if m.stamp_ns / 1e9 <= 2.5)
+    assert fault == "dead channels" or heard_well(found[-1].heard)
+    assert all(heard_well(m.heard) for m in found if m.stamp_ns / 1e9 <= 2.5)
 
 
 def test_sound_with_half_of_its_samples_clipped_is_unusable() -> None:
-    sound = 20.0 * plane_wave(0.3, 5.0)
+    sound = 20.0 * wave(0.3, 5.0)
     sound *= np.exp(np.minimum(np.arange(len(sound)) / RATE_HZ - 4.0, 0.0))[:, None]
     half = np.quantile(np.abs(sound[-RATE_HZ:]), 0.4)
-    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(np.clip(sound, -half, half))
-    assert measured[0].heard.share > 0.9
-    assert (measured[-1].heard.share, measured[-1].heard.reason) == (0.0, "clipped")
+    first, *_, last = measured(np.clip(sound, -half, half))
+    assert first.heard.share > 0.9 and (last.heard.share, last.heard.reason) == (0.0, "clipped")
 
 
 def test_a_loud_visible_source_lowers_the_share_heard() -> None:
-    sound = plane_wave(0.3, 6.0)
+    sound = wave(0.3, 6.0)
     sound *= np.exp(np.clip(np.arange(len(sound)) / RATE_HZ - 2.0, 0.0, 2.5))[:, None]
-    measured = AcousticAdapter(ARRAY, RATE_HZ, Level()).measure(sound)
-    assert heard_well(measured[5].heard)
-    assert measured[-1].heard.reason == "loud source in view"
-    assert measured[-1].heard.usable and measured[-1].heard.share < 0.5
+    *found, last = measured(sound)
+    assert heard_well(found[5].heard)
+    assert last.heard.reason == "loud source in view" and last.heard.usable and last.heard.share < 0.5
 
 
-def test_keeps_the_last_frame_for_plots() -> None:
-    adapter = AcousticAdapter(ARRAY, RATE_HZ, Level())
-    assert adapter.last_frame is None
-    measured = adapter.measure(plane_wave(0.3, 1.2))
-    assert adapter.last_frame is not None
-    assert adapter.last_frame.stamp_ns == measured[-1].stamp_ns
+# A guard reduces the evidence of foreign sounds, not of warning signals; road users set the camera query.
+
+SLOW_HZ = 6000
+# Independent noise is unusable if channels are watched.
+UNWATCHED = FrontEndSettings(nfft=feature_nfft(SLOW_HZ), watch_channels=False)
+LINE = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.0, -0.3, 0.0]])
+unwatched = partial(AcousticAdapter, LINE, SLOW_HZ, front_end_settings=UNWATCHED)
+ALARMED = Fixed(3.0, 0.0, visible=-2.0, none=-1.0)
+SURE = Fixed(6.0, 0.0, visible=-2.0, none=-1.0)
+# Evidence of no vehicle, beyond the margin of any guard.
+SILENT = Fixed(-6.0, -6.0, visible=-2.0)
+STEADY, SHARED = MEASURES.index("line holds"), MEASURES.index("together 2.2")
+NAMES = (*MEASURES, *BANDS)
+
+
+def guard() -> DomainGuard:
+    """Return a guard for common modulation (foreign) and a steady line (signal)."""
+    weights = np.zeros((3, len(MEASURES)))
+    weights[1, SHARED], weights[2, STEADY] = 12.0, 20.0
+    return DomainGuard(MEASURES, ("speech",), ("siren",), weights, np.array([12.0, 0.0, 0.0]), threshold=0.0)
+
+
+def sounds() -> dict[type, np.ndarray]:
+    """Return three seconds of noise, of noise modulated at 4 Hz, and of a tone."""
+    rng, time = np.random.default_rng(1), np.arange(3 * SLOW_HZ) / SLOW_HZ
+    noise = 0.02 * rng.standard_normal((len(time), 3))
+    swelling = noise * (1.05 + np.sin(8.0 * np.pi * time))[:, None]
+    tone = noise + 0.2 * np.sin(2.0 * np.pi * 700.0 * time)[:, None]
+    return {Familiar: noise, Foreign: swelling, WarningSignal: tone}
+
+
+def followed(world: WorldFilter, told: list[Measurement]) -> WorldFilter:
+    for one in told:
+        world = world.update(one)
+    return world
+
+
+@pytest.mark.parametrize("kind", [Familiar, Foreign, WarningSignal])
+def test_only_foreign_sounds_lose_evidence(kind: type) -> None:
+    found = unwatched(ALARMED, guard=guard()).measure(sounds()[kind])
+    assert [one.domain for one in found[:11]] == [None] * 11
+    last, plain = found[-1], unwatched(ALARMED).measure(sounds()[kind])[-1]
+    assert isinstance(last.domain, kind)
+    said = [value - plain.signature.none for value in plain.signature.hidden]
+    heard = [value - last.signature.none for value in last.signature.hidden]
+    assert min(said) >= 0.0
+    assert heard == pytest.approx([max(one - 2.0, 0.0) if kind is Foreign else one for one in said], abs=1e-6)
+    unknown = 1.0 / (1.0 + np.exp(last.domain.log_odds)) if isinstance(last.domain, Foreign) else 1.0
+    assert last.heard.share == pytest.approx(plain.heard.share * unknown)
+    assert (last.heard.reason == FOREIGN) == isinstance(last.domain, Foreign)
+    again = WorldState.from_json(followed(WorldFilter(), found).state.to_json())
+    assert again.domain == last.domain
+    assert kind is not Foreign or again.to_dict()["domain"]["reason"] == "sounds like speech"
+
+
+def test_a_foreign_sound_is_not_taken_for_silence() -> None:
+    heard = unwatched(SILENT, guard=guard()).measure(sounds()[Foreign])
+    foreign = [one for one in heard if isinstance(one.domain, Foreign)]
+    warned = followed(WorldFilter(), unwatched(ALARMED).measure(sounds()[Familiar]))
+    later = [replace(one, stamp_ns=warned.stamp_ns + 10**8 * (i + 1)) for i, one in enumerate(foreign[:5])]
+    silent = followed(warned, [replace(one, heard=Heard()) for one in later])
+    ends = silent, followed(warned, later), warned.predict_to(later[-1].stamp_ns)
+    left = [one.belief.hypotheses[0] for one in ends]
+    assert left[0] < 0.5 * left[2]
+    assert left[1] == pytest.approx(left[2], rel=0.2)
+
+
+def by_colour() -> RoadUserModel:
+    """Return a model in which low sound is a truck and high sound a car."""
+    weights = np.zeros((4, len(NAMES)))
+    low, high = NAMES.index("band 80"), NAMES.index("band 1850")
+    weights[1, low], weights[1, high], weights[0, low], weights[0, high] = 3.0, -3.0, -3.0, 3.0
+    return RoadUserModel(NAMES, ("car", "truck", "unknown", "van"), weights, np.zeros(4))
+
+
+def test_models_of_other_measures_are_refused() -> None:
+    others, users = ("loudness", *MEASURES[1:]), ("loudness", *NAMES[1:])
+    with pytest.raises(OutOfDomainError, match="guard"):
+        unwatched(ALARMED, guard=replace(guard(), measures=others))
+    with pytest.raises(OutOfDomainError, match="road users"):
+        unwatched(ALARMED, road_users=replace(by_colour(), measures=users))
+
+
+def coloured(deep: bool) -> np.ndarray:
+    noise = np.random.default_rng(1).standard_normal((3 * SLOW_HZ, 3))
+    spectrum, hz = np.fft.rfft(noise, axis=0), np.fft.rfftfreq(len(noise), 1.0 / SLOW_HZ)
+    tilt = (np.maximum(hz, 50.0) / 500.0) ** (-1.0 if deep else 1.0)
+    return np.asarray(0.02 * np.fft.irfft(spectrum * tilt[:, None], len(noise), axis=0), np.float32)
+
+
+class Asked:
+    """A channel that records its queries."""
+
+    def __init__(self) -> None:
+        self.labels: list[Collection[str] | None] = []
+
+    def ask(self, stamp_ns: int, bearing: object, labels: Any = None, side: object = None) -> CoEvidence:
+        self.labels.append(labels)
+        return Absent(0.1)
+
+    def sightings(self, stamp_ns: int) -> tuple[()]:
+        return ()
+
+    def last_look(self, stamp_ns: int) -> None:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("deep", "name", "labels"), [(True, "truck", {"truck", "bus"}), (False, "car", {"car"})]
+)
+def test_the_acoustic_kind_sets_the_camera_query_and_the_entity(
+    deep: bool, name: str, labels: set[str]
+) -> None:
+    asked = Asked()
+    found = unwatched(SURE, asked, road_users=by_colour()).measure(coloured(deep))
+    assert [one.kinds for one in found[:11]] == [()] * 11
+    assert asked.labels[:11] == [None] * 11
+    assert max(found[-1].kinds, key=lambda one: one[1])[0] == name
+    asked_again(found[-1], asked)
+    assert asked.labels[-2:] == [labels, labels]
+    world, said = WorldFilter(), []
+    for one in found:
+        world = world.update(one)
+        (entity,) = world.state.entities
+        said.append({kind.label: kind.probability for kind in entity.classification})
+        assert sum(said[-1].values()) <= 1.0 + 1e-9
+    assert said[0] == {"unknown": 1.0}
+    assert said[-1][name] > 0.8
+    # After a detection the label of the detector is kept.
+    assert world.memory is not None
+    (track,) = world.memory.tracks.rows()
+    seen = Tracks.of([replace(track, last_seen_ns=1, labels=(("car", 0.9),))])
+    assert heard_as(seen, 0, found[-1].kinds, StreetModel()) == (("car", 0.9),)
+
+
+def test_a_foreign_sound_has_no_kind_and_a_siren_its_own() -> None:
+    model, silence = by_colour(), np.zeros(len(NAMES))
+    assert heard_kinds(model, silence, Foreign("sounds like music", 3.0)) == ()
+    siren = heard_kinds(model, silence, WarningSignal("siren", 9.0))
+    assert dict(siren)["siren"] > 0.99 and expected_labels(siren) is None
+    assert "siren" not in dict(heard_kinds(model, silence, WarningSignal("horn", 9.0)))
+
+
+def query(*labels: str) -> VisionQuery:
+    """Return a camera with earlier detections of these classes and an empty image now."""
+    frames = [boxed((600.0, 300.0, 800.0, 600.0), label=one) for one in labels]
+    keep = DetectionFilter(frozenset({"car", "truck"}))
+    return VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate([*frames, EMPTY], 10.0), keep=keep)
+
+
+def test_an_excluded_class_raises_the_miss_rate_or_is_unqueried() -> None:
+    ask = partial(query("car", "truck").ask, 200_000_000, Bearing(0.0, 0.05))
+    car, either = ask({"car"}), ask({"car", "bus"})
+    assert isinstance(car, Absent) and isinstance(either, Absent)
+    assert either.miss_rate == pytest.approx(0.5 * (1.0 + car.miss_rate))
+    assert isinstance(ask({"bicycle"}), Unqueried)
+    # A detector with one class is queried for any class.
+    one = partial(query("car", "car").ask, 200_000_000, Bearing(0.0, 0.05))
+    assert one({"truck"}) == one() != ask({"train"})
+
+
+def test_without_kinds_an_entity_is_unknown() -> None:
+    said, unknown = SURE.said, NotUsable("-")
+    told = [Measurement(hop * 10**8, said, Unqueried("-"), unknown, unknown) for hop in range(1, 6)]
+    (entity,) = followed(WorldFilter(), told).state.entities
+    assert [(one.label, one.probability) for one in entity.classification] == [("unknown", 1.0)]

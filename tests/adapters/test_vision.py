@@ -1,35 +1,26 @@
-"""The vision query: its answers, its miss rate and mirror symmetry."""
+"""The vision query of one or several cameras: its results, its miss rate and mirror symmetry."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_boxes import EMPTY, boxed, crossing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.abduction.co_evidence import Absent, CoEvidence, MissRateTable, Present, Sector, Unqueried
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, parked
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery
-from worldstate.ground.errors import InputFileError
+from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery
 from worldstate.ground.values import NotUsable, nanoseconds, wrap_angle
-from worldstate.measurement.measurement import Bearing, CoEvidenceChannel
+from worldstate.measurement.measurement import Bearing
 
 CENTRED = PinholeCamera.ovad(position_m=(-0.567, 0.0, -0.485))
 TABLE = MissRateTable((0.0, 20.0, 40.0), (0.0, 1.0), ((0.04, 0.9), (0.1, 0.95), (0.3, 1.0)))
 AZIMUTHS = st.floats(-math.pi, math.pi)
-DEGREE = math.pi / 180
-
-
-def frame(*boxes: tuple[float, ...], label: str = "car", score: float = 0.9) -> DetectionFrame:
-    return DetectionFrame(np.array(boxes).reshape(-1, 4), np.full(len(boxes), score), (label,) * len(boxes))
-
-
-def crossing(first_px: float, step_px: float, frames: int = 40, **how: object) -> DetectionLog:
-    """Return a car that crosses the image, to the right for a positive step."""
-    boxes = [(first_px + step_px * i, 500.0, first_px + step_px * i + 200.0, 640.0) for i in range(frames)]
-    return DetectionLog.at_rate([frame(box, **how) for box in boxes], 10.0)  # type: ignore[arg-type]
+TEN_DEG, NOW, COARSE = math.radians(10.0), nanoseconds(2.0), NotUsable("coarse")
+NOTHING = DetectionLog.at_rate([EMPTY] * 40, 10.0)
 
 
 def bearing(azimuth_rad: float) -> Bearing:
@@ -40,29 +31,14 @@ def query(log: DetectionLog | None, keep: DetectionFilter | None = None) -> Visi
     return VisionQuery(CENTRED, log, TABLE, keep=keep)
 
 
-EMPTY = DetectionLog.at_rate([frame()] * 40, 10.0)
-
-
-def test_is_a_channel() -> None:
-    channel: CoEvidenceChannel = query(None)
-    assert channel.sightings(0) == ()
-
-
 def test_unqueried_has_its_reason() -> None:
     assert query(None).ask(0, bearing(0.0)) == Unqueried("no detections file")
-    assert query(EMPTY).ask(nanoseconds(9.0), bearing(0.0)) == Unqueried("no frame at 9.000 s")
-    assert query(EMPTY).ask(-1_000_000_000, bearing(0.0)) == Unqueried("no frame at -1.000 s")
-    assert query(EMPTY).ask(nanoseconds(2.0), bearing(1.2)) == Unqueried("sector outside the field of view")
-
-
-def test_a_kind_without_camera_classes_is_unqueried() -> None:
-    assert isinstance(query(EMPTY).ask(nanoseconds(2.0), bearing(0.0), ()), Unqueried)
-
-
-def test_an_empty_frame_is_an_absence() -> None:
-    answer = query(EMPTY).ask(nanoseconds(2.0), bearing(0.0))
-    assert isinstance(answer, Absent)
-    assert answer.clutter_rate == 0.01
+    assert query(NOTHING).ask(nanoseconds(9.0), bearing(0.0)) == Unqueried("no frame at 9.000 s")
+    assert query(NOTHING).ask(-1_000_000_000, bearing(0.0)) == Unqueried("no frame at -1.000 s")
+    assert query(NOTHING).ask(NOW, bearing(1.2)) == Unqueried("sector outside the field of view")
+    assert isinstance(query(NOTHING).ask(NOW, bearing(0.0), ()), Unqueried), "no class that a camera sees"
+    answer = query(NOTHING).ask(NOW, bearing(0.0))
+    assert isinstance(answer, Absent) and answer.clutter_rate == 0.01
 
 
 @given(first_px=st.floats(200.0, 500.0), step_px=st.floats(10.0, 30.0), hop=st.integers(10, 39))
@@ -70,82 +46,52 @@ def test_an_empty_frame_is_an_absence() -> None:
 def test_a_moving_car_is_found_in_its_sector_and_nowhere_else(
     first_px: float, step_px: float, hop: int
 ) -> None:
-    asked = query(crossing(first_px, step_px))
-    stamp_ns = nanoseconds(hop / 10)
+    asked, stamp_ns = query(crossing(first_px, step_px)), nanoseconds(hop / 10)
     (seen,) = asked.sightings(stamp_ns)
     assert seen.moving
-    assert isinstance(asked.ask(stamp_ns, bearing(seen.azimuth_rad)), Present)
-    beyond = 10 * DEGREE + seen.width_rad / 2 + 0.001
-    for away in (seen.azimuth_rad + beyond, seen.azimuth_rad - beyond):
-        assert not isinstance(asked.ask(stamp_ns, bearing(away)), Present)
-    reach = beyond - 0.002
-    for at_its_edge in (seen.azimuth_rad + reach, seen.azimuth_rad - reach):
-        assert isinstance(asked.ask(stamp_ns, bearing(at_its_edge)), Present)
+    edge = TEN_DEG + seen.width_rad / 2
+    for off, found in ((0.0, True), (edge - 0.001, True), (edge + 0.001, False)):
+        for azimuth in (seen.azimuth_rad + off, seen.azimuth_rad - off):
+            assert isinstance(asked.ask(stamp_ns, bearing(azimuth)), Present) is found
 
 
 def test_a_parked_car_is_a_sighting_and_an_absence() -> None:
     asked = query(crossing(900.0, 0.0))
-    (seen,) = asked.sightings(nanoseconds(2.0))
+    (seen,) = asked.sightings(NOW)
     assert not seen.moving
-    assert isinstance(asked.ask(nanoseconds(2.0), bearing(seen.azimuth_rad)), Absent)
+    assert isinstance(asked.ask(NOW, bearing(seen.azimuth_rad)), Absent)
 
 
 def test_only_the_expected_class_counts() -> None:
     keep = DetectionFilter(labels={"car", "bicycle"})
     asked = query(crossing(700.0, 20.0, label="bicycle"), keep=keep)
-    stamp_ns = nanoseconds(2.0)
-    (seen,) = asked.sightings(stamp_ns)
-    assert isinstance(asked.ask(stamp_ns, bearing(seen.azimuth_rad), {"car"}), Absent)
-    assert isinstance(asked.ask(stamp_ns, bearing(seen.azimuth_rad), {"bicycle"}), Present)
-    assert isinstance(asked.ask(stamp_ns, bearing(seen.azimuth_rad)), Present)
+    (seen,) = asked.sightings(NOW)
+    for labels, answer in (({"car"}, Absent), ({"bicycle"}, Present), (None, Present)):
+        assert isinstance(asked.ask(NOW, bearing(seen.azimuth_rad), labels), answer)
 
 
 @pytest.mark.parametrize("how", [{"score": 0.74}, {"label": "truck"}])
 def test_a_filtered_box_is_unqueried(how: dict[str, object]) -> None:
     asked = query(crossing(700.0, 20.0, **how))
-    assert asked.sightings(nanoseconds(2.0)) == ()
-    assert isinstance(asked.ask(nanoseconds(2.0), bearing(0.0)), Unqueried)
-    counted = DetectionLog((crossing(700.0, 20.0).frames[0], *asked.detections.frames[1:]), EMPTY.stamps_ns)
-    assert isinstance(query(counted).ask(nanoseconds(2.0), bearing(0.0)), Unqueried)
-    assert isinstance(query(counted).ask(nanoseconds(2.0), bearing(-0.5)), Absent)
+    assert asked.sightings(NOW) == ()
+    assert isinstance(asked.ask(NOW, bearing(0.0)), Unqueried)
+    counted = replace(asked.detections, frames=(boxed((700, 500, 900, 640)), *asked.detections.frames[1:]))
+    assert isinstance(query(counted).ask(NOW, bearing(0.0)), Unqueried)
+    assert isinstance(query(counted).ask(NOW, bearing(-0.5)), Absent)
 
 
 def test_a_coarse_bearing_queries_the_whole_side() -> None:
     asked = query(crossing(300.0, 5.0))
-    stamp_ns = nanoseconds(2.0)
-    assert isinstance(asked.ask(stamp_ns, bearing(-0.3), side="left"), Present)
-    assert isinstance(asked.ask(stamp_ns, bearing(0.3), side="right"), Absent)
-    assert isinstance(asked.ask(stamp_ns, NotUsable("flat")), Present)
-
-
-@pytest.mark.long
-@given(azimuth=AZIMUTHS, degradation=st.floats(0.0, 1.0))
-@settings(max_examples=60, deadline=None)
-def test_the_miss_rate_is_the_expectation_over_the_sector(azimuth: float, degradation: float) -> None:
-    answer = VisionQuery(CENTRED, EMPTY, TABLE, degradation).ask(nanoseconds(2.0), bearing(azimuth))
-    across = azimuth + 10 * DEGREE * ((np.arange(4000) + 0.5) / 2000 - 1.0)
-    angles, seen = CENTRED.off_axis(across), CENTRED.sees(across)
-    betas = [TABLE(a, degradation) if s else 1.0 for a, s in zip(angles, seen, strict=True)]
-    expected = np.mean(betas)
-    if isinstance(answer, Unqueried):
-        assert expected == pytest.approx(1.0, abs=1e-6)
-    else:
-        assert answer.miss_rate == pytest.approx(expected, abs=2e-3)
-
-
-def test_degradation_may_change_with_time() -> None:
-    fading = VisionQuery(CENTRED, EMPTY, TABLE, lambda stamp_ns: stamp_ns / 4e9)
-    betas = [fading.ask(nanoseconds(t), bearing(0.0)).miss_rate for t in (0.0, 1.0, 2.0, 3.0)]  # type: ignore[union-attr]
-    assert betas == sorted(betas)
-    assert betas[-1] > 0.5
+    assert isinstance(asked.ask(NOW, bearing(-0.3), side="left"), Present)
+    assert isinstance(asked.ask(NOW, bearing(0.3), side="right"), Absent)
+    assert isinstance(asked.ask(NOW, COARSE), Present)
 
 
 def mirrored(log: DetectionLog) -> DetectionLog:
-    width = CENTRED.width_px
-    flip = np.array([-1.0, 1.0, -1.0, 1.0])
+    width, flip = CENTRED.width_px, np.array([-1.0, 1.0, -1.0, 1.0])
     shift = np.array([width, 0.0, width, 0.0])
     flipped = [replace(f, boxes_px=f.boxes_px[:, [2, 1, 0, 3]] * flip + shift) for f in log.frames]
-    return DetectionLog(tuple(flipped), log.stamps_ns)
+    return replace(log, frames=tuple(flipped))
 
 
 def same(one: CoEvidence, other: CoEvidence) -> bool:
@@ -156,20 +102,17 @@ def same(one: CoEvidence, other: CoEvidence) -> bool:
     azimuth=st.floats(-1.5, 1.5),
     first_px=st.floats(0.0, 1700.0),
     step_px=st.floats(-20.0, 20.0),
-    side=st.sampled_from([None, "left", "right"]),
+    sides=st.sampled_from([(None, None), ("left", "right"), ("right", "left")]),
 )
 @settings(deadline=None)
 def test_the_mirrored_question_has_the_same_answer(
-    azimuth: float, first_px: float, step_px: float, side: str | None
+    azimuth: float, first_px: float, step_px: float, sides: tuple
 ) -> None:
     step_px = float(np.clip(step_px, -first_px / 25, (1736 - first_px) / 25))
-    log = crossing(first_px, step_px, frames=25)
-    stamp_ns = nanoseconds(2.0)
-    other_side = {"left": "right", "right": "left", None: None}[side]
-    here = query(log).ask(stamp_ns, bearing(azimuth), side=side)  # type: ignore[arg-type]
-    there = query(mirrored(log)).ask(stamp_ns, bearing(-azimuth), side=other_side)  # type: ignore[arg-type]
-    assert same(here, there)
-    (left,), (right,) = query(log).sightings(stamp_ns), query(mirrored(log)).sightings(stamp_ns)
+    log = crossing(first_px, step_px, images=25)
+    here = query(log).ask(NOW, bearing(azimuth), side=sides[0])
+    assert same(here, query(mirrored(log)).ask(NOW, bearing(-azimuth), side=sides[1]))
+    (left,), (right,) = query(log).sightings(NOW), query(mirrored(log)).sightings(NOW)
     assert left.azimuth_rad == pytest.approx(-right.azimuth_rad, abs=1e-9)
     assert (left.moving, left.std_rad) == (right.moving, pytest.approx(right.std_rad))
 
@@ -180,10 +123,9 @@ def test_the_overlap_is_the_intersection_of_sectors(
 ) -> None:
     one, other = Sector(a, half_a), Sector(b, half_b)
     common = one.overlap(other)
-    in_both = one.touches(at) and other.touches(at)
     margin = min(abs(abs(wrap_angle(at - s.centre_rad)) - s.half_width_rad) for s in (one, other))
     if margin > 1e-9:
-        assert (common is not None and common.touches(at)) == in_both
+        assert (common is not None and common.touches(at)) == (one.touches(at) and other.touches(at))
 
 
 @given(right=AZIMUTHS, width=st.floats(0.01, 6.2))
@@ -193,15 +135,130 @@ def test_a_sector_between_two_edges(right: float, width: float) -> None:
     assert abs(wrap_angle(sector.centre_rad - right - width / 2)) < 1e-9
 
 
-def test_refuses_detections_of_another_camera() -> None:
-    with pytest.raises(InputFileError, match=r"detections: frame 19: expected boxes within .* 1936 x 1216"):
-        query(crossing(1700.0, 2.0))
-
-
 def test_a_bearing_behind_an_occluder_queries_the_line_of_sight() -> None:
-    sight = Sector(0.0, 0.5)
-    query = VisionQuery(CENTRED, EMPTY, line_of_sight=sight)
-    behind, anywhere = (query.ask(nanoseconds(1.0), asked) for asked in (bearing(0.9), NotUsable("coarse")))
-    assert isinstance(behind, Absent)
-    assert behind == anywhere
-    assert behind.miss_rate < 0.2
+    asked = VisionQuery(CENTRED, NOTHING, line_of_sight=Sector(0.0, 0.5))
+    behind, anywhere = (asked.ask(NOW, one) for one in (bearing(0.9), COARSE))
+    assert isinstance(behind, Absent) and behind == anywhere and behind.miss_rate < 0.2
+
+
+# Several cameras: the joint miss rate against a sum over azimuths.
+
+
+def camera(yaw_deg: float, car: bool = False) -> VisionQuery:
+    lens = PinholeCamera(640, 480, math.pi / 4, (0.0, 0.0, 0.0), math.radians(yaw_deg), 0.0)
+    log = DetectionLog((boxed((300, 100, 340, 300)) if car else EMPTY,), np.array([NOW]))
+    return VisionQuery(lens, log)
+
+
+def fine_miss_rate(cameras: list[VisionQuery], azimuth_rad: float, degradation: float = 0.0) -> float:
+    """Return the mean over a fine grid of a sector of the product of the miss rates."""
+    grid = azimuth_rad + TEN_DEG * ((np.arange(4000) + 0.5) / 2000 - 1.0)
+    missed = np.ones_like(grid)
+    for one in cameras:
+        angles, seen = one.camera.off_axis(grid), one.camera.sees(grid)
+        missed *= np.where(seen, one.miss_rate.over(angles, degradation, "car"), 1.0)
+    return float(missed.mean())
+
+
+@pytest.mark.long
+@given(azimuth=AZIMUTHS, degradation=st.floats(0.0, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_the_miss_rate_is_the_expectation_over_the_sector(azimuth: float, degradation: float) -> None:
+    asked = VisionQuery(CENTRED, NOTHING, TABLE, degradation)
+    answer, expected = asked.ask(NOW, bearing(azimuth)), fine_miss_rate([asked], azimuth, degradation)
+    missed = 1.0 if isinstance(answer, Unqueried) else answer.miss_rate
+    assert missed == pytest.approx(expected, abs=1e-6 if isinstance(answer, Unqueried) else 2e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-120, 120), min_size=2, max_size=4), st.floats(-1.2, 1.2))
+def test_the_joint_miss_rate_is_the_mean_over_azimuths(yaws_deg: list[float], azimuth_rad: float) -> None:
+    cameras = [camera(yaw) for yaw in yaws_deg]
+    said = SeveralCameras({str(i): one for i, one in enumerate(cameras)}).ask(NOW, bearing(azimuth_rad))
+    expected = fine_miss_rate(cameras, azimuth_rad)
+    if isinstance(said, Unqueried):
+        assert expected == 1.0
+    else:
+        assert said.miss_rate == pytest.approx(expected, abs=0.004)
+
+
+def test_a_side_that_two_cameras_share_is_searched_by_both() -> None:
+    front, left = camera(0.0), camera(80.0)
+    both = SeveralCameras({"front": front, "left": left})
+    alone = [one.ask(NOW, COARSE, None, "left").miss_rate for one in (front, left)]  # type: ignore[union-attr]
+    assert both.ask(NOW, COARSE, None, "left").miss_rate < 0.5 * min(alone)  # type: ignore[union-attr]
+    # The right side is outside the view of the left camera.
+    assert both.ask(NOW, COARSE, None, "right") == front.ask(NOW, COARSE, None, "right")
+
+
+def test_a_detection_of_one_camera_is_present() -> None:
+    both = SeveralCameras({"front": camera(0.0), "left": camera(60.0, car=True)})
+    assert isinstance(both.ask(NOW, bearing(1.05)), Present)
+    looks = both.looks(NOW)
+    assert [(one.look.sensor, len(one.sightings)) for one in looks] == [("front", 0), ("left", 1)]
+    assert looks[1].look.sector_rad == pytest.approx((math.radians(15.0), math.radians(105.0)))
+    assert looks[1].sightings[0].azimuth_rad == pytest.approx(math.radians(60.0))
+
+
+def test_a_camera_without_an_image_does_not_block_others() -> None:
+    blind = VisionQuery(PinholeCamera.ovad(), DetectionLog((EMPTY,), np.array([0])))
+    both = SeveralCameras({"front": blind, "left": camera(60.0, car=True)})
+    look = both.last_look(NOW)
+    assert look is not None and look.sensor == "left" and len(both.sightings(NOW)) == 1
+    assert isinstance(SeveralCameras({"front": blind}).ask(NOW, COARSE), Unqueried)
+
+
+# The choice of boxes and images: the filter of the authors, the latest image, parked cars.
+
+
+def test_the_authors_filter() -> None:
+    frame = boxed(*([0, 0, 50, height] for height in (101, 100, 200, 200, 200)))
+    labels, scores = ("car", "car", "motorcycle", "truck", "car"), np.array([0.75, 0.9, 0.8, 0.99, 0.74])
+    frame = replace(frame, labels=labels, scores=scores)
+    assert frame.select(DetectionFilter()).tolist() == [0, 2]
+    assert frame.select(DetectionFilter(labels={"truck"}, min_score=0.0, min_height_px=0.0)).tolist() == [3]
+
+
+@given(
+    rate_hz=st.sampled_from([5.0, 10.0, 29.97, 30.0]),
+    time_s=st.floats(0.0, 12.0),
+    max_age_s=st.floats(0.01, 1.0),
+)
+def test_the_latest_frame_is_not_from_the_future_nor_too_old(
+    rate_hz: float, time_s: float, max_age_s: float
+) -> None:
+    log, times = DetectionLog.at_rate([EMPTY] * 80, rate_hz), np.arange(80) / rate_hz
+    index = log.latest(nanoseconds(time_s), nanoseconds(max_age_s))
+    shown = [i for i in range(80) if times[i] <= time_s + 0.001]
+    expected = shown[-1] if shown and time_s - times[shown[-1]] <= max_age_s else None
+    if min(abs(times - time_s - 0.001)) > 1e-8 and abs(time_s - times[shown[-1]] - max_age_s) > 1e-8:
+        assert index == expected
+
+
+def test_every_decision_at_47998_hz_finds_the_frame_of_its_hop() -> None:
+    log = DetectionLog.at_rate([EMPTY] * 200, 10.0)
+    stamps_ns = [nanoseconds(round(hop * 47_998 / 10) / 47_998) for hop in range(10, 200)]
+    assert [log.latest(one, nanoseconds(0.15)) for one in stamps_ns] == [*range(10, 200)]
+
+
+STILL = [900.0, 500.0, 1100.0, 650.0]
+
+
+def moving_log(step_px: float, missed: tuple[int, ...] = ()) -> DetectionLog:
+    """Return a car that moves `step_px` per image beside a parked one."""
+    moving = [[10.0 + step_px * i, 500.0, 150.0 + step_px * i, 620.0] for i in range(30)]
+    frames = [boxed(box) if i in missed else boxed(box, STILL) for i, box in enumerate(moving)]
+    return DetectionLog.at_rate(frames, 10.0)
+
+
+@given(step_px=st.floats(1.0, 60.0), frame=st.integers(0, 29))
+def test_only_a_box_that_stood_for_a_second_is_parked(step_px: float, frame: int) -> None:
+    log = moving_log(step_px)
+    known = DetectionLog(log.frames[: frame + 1], log.stamps_ns[: frame + 1])
+    for one in (log, known):  # Later images do not matter
+        assert parked(one, frame, log.frames[frame].boxes_px).tolist() == [False, frame >= 10]
+
+
+def test_two_misses_in_a_second_do_not_unpark() -> None:
+    assert parked(moving_log(20.0, (14, 17)), 20, np.array([STILL]))
+    assert not parked(moving_log(20.0, (12, 14, 17)), 20, np.array([STILL]))

@@ -1,0 +1,31 @@
+"""Made-up sound at the microphones of an array, and a model with a fixed result."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.frontend.array.microphone_array import MicrophoneArray
+
+THREE = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
+
+
+def plane_wave(
+    array: MicrophoneArray, rate_hz: float, azimuth_rad: float, seconds: float, seed: int = 3
+) -> np.ndarray:
+    """Return broadband sound from far away with a little noise of every microphone's own, shape (n, M)."""
+    n, rng = round(seconds * rate_hz), np.random.default_rng(seed)
+    spectrum = np.fft.rfft(rng.standard_normal(n))[:, None]
+    delays_s = array.delays_s(azimuth_rad).ravel()
+    late = spectrum * np.exp(-2j * np.pi * np.fft.rfftfreq(n, 1.0 / rate_hz)[:, None] * delays_s)
+    noise = 0.05 * rng.standard_normal((n, array.n_microphones))
+    return (0.05 * (np.fft.irfft(late, n, axis=0) + noise)).astype(np.float32)
+
+
+class Fixed:
+    """A signature model with one result for every window."""
+
+    def __init__(self, *hidden: float, visible: float = 0.0, none: float = 0.0) -> None:
+        self.said = SignatureEvidence(("left", "right"), hidden or (0.0, 0.0), visible, none)
+
+    def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
+        return self.said
