@@ -96,10 +96,9 @@ def smooth_form(data: bytes, stated: Encoding, channels: int) -> str | None:
     for name, kind in _FORMS.items():
         other = name != stated and not (stated == "f32" and name.startswith("s32"))
         if other and (suspect or (name == "s16" and stated.endswith("32"))):
-            read = (
-                np.frombuffer(data, kind).reshape(-1, channels) if kind else decoded(data, "PCM_24", channels)
-            )
-            if _likeness(read)[0].min(initial=1e9) > _SMOOTH:
+            plain = np.frombuffer(data, kind).reshape(-1, channels) if kind else None
+            alike, _ = _likeness(decoded(data, "PCM_24", channels) if plain is None else plain)
+            if len(alike) and alike.min() > _SMOOTH:  # Without sound no format is smoother than another
                 return name
     return None
 

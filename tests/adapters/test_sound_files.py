@@ -1,10 +1,11 @@
-"""Headers that contradict the samples: all samples are read, or an error is raised."""
+"""Sound files: exact reading in blocks, headers that contradict the samples, and refusals with the file."""
 
 import io
 import logging
 import struct
+from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,16 +15,154 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from worldstate.adapters.audio.plain_samples import SUBTYPES, Encoding, decoded, four_byte_form
-from worldstate.adapters.audio.sound_file import RawPcm, open_audio, open_sound
-from worldstate.ground.errors import InputFileError
+from worldstate.adapters.audio.sound_file import RawPcm, SilentChannelsError, open_audio, open_sound
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 RATE_HZ = 8000
-# arecord, SoX and ffmpeg; the last of each pair is rounded to whole samples of three channels.
-OPEN_SIZES = (0, 0x80000000, 0x7FFFFFFE, 0x7FFFFF00, 0x7FFFF000, 0xFFFFFFFF, 0xFFFFFFFC, 0xFFFFF000)
+FORMATS = [
+    *(("WAV", "PCM_24"), ("WAV", "PCM_16"), ("WAV", "FLOAT"), ("WAVEX", "PCM_24")),
+    *(("RF64", "PCM_24"), ("W64", "PCM_24"), ("W64", "DOUBLE"), ("FLAC", "PCM_24")),
+]
 
 
 def noise(frames: int = 9001, channels: int = 3, scale: float = 0.1) -> np.ndarray:
     return np.random.default_rng(7).normal(0.0, scale, (frames, channels)).clip(-0.9, 0.9).astype(np.float32)
+
+
+def write(path: Path, samples: np.ndarray, container: str = "WAV", encoding: str = "PCM_24") -> Path:
+    soundfile.write(path, samples, RATE_HZ, format=container, subtype=encoding)
+    return path
+
+
+def heard(path: Path) -> np.ndarray:
+    with open_audio(path) as source:
+        return np.concatenate(list(source.blocks(1000)))
+
+
+def refused(problem: str, path: Path, read: Callable[[Path], object] = open_audio, **more: Any) -> None:
+    with pytest.raises(InputFileError, match=problem) as raised:
+        read(path, **more)
+    assert str(raised.value).startswith(f"{path}: ") and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(("container", "encoding"), FORMATS)
+def test_reading_returns_the_written_samples(tmp_path: Path, container: str, encoding: str) -> None:
+    with open_audio(write(tmp_path / "sound", noise(), container, encoding), expect_channels=3) as source:
+        blocks = list(source.blocks(4800))
+        assert (source.sample_rate_hz, source.channels, source.frames) == (RATE_HZ, 3, 9001)
+    assert [len(block) for block in blocks] == [4800, 4201]
+    assert all(block.dtype == np.float32 for block in blocks)
+    step = 2.0**-14 if encoding == "PCM_16" else 2.0**-22
+    np.testing.assert_allclose(np.concatenate(blocks), noise(), atol=step)
+
+
+@pytest.fixture(scope="module")
+def long_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("audio") / "long.wav", noise())
+
+
+@given(frames=st.integers(1, 12_000))
+@settings(max_examples=25, deadline=None)
+def test_block_size_does_not_matter(long_file: Path, frames: int) -> None:
+    whole, _ = soundfile.read(long_file, dtype="float32")
+    with open_audio(long_file) as source:
+        blocks, again = list(source.blocks(frames)), next(source.blocks(frames))
+    assert all(len(block) == frames for block in blocks[:-1])
+    np.testing.assert_array_equal(np.concatenate(blocks), whole)
+    np.testing.assert_array_equal(again, blocks[0])
+    assert not np.shares_memory(again, blocks[0])
+
+
+def test_blocks_need_a_length_and_an_open_file(long_file: Path) -> None:
+    with open_audio(long_file) as source:
+        for frames in (0, -1):
+            with pytest.raises(InvalidArgumentError, match="frames"):
+                next(source.blocks(frames))
+    with pytest.raises(InvalidArgumentError, match="closed"):
+        next(source.blocks())
+
+
+def test_a_silent_file_of_one_microphone_is_a_silent_channel(tmp_path: Path) -> None:
+    samples = noise(channels=4)
+    samples[:, 2] = 0.0
+    files = tuple(write(tmp_path / f"{k}.wav", samples[:, k], encoding="FLOAT") for k in range(4))
+    with open_sound(files, 4, strict=False) as source:
+        assert source.silent_channels == (3,)
+        np.testing.assert_array_equal(np.concatenate(list(source.blocks())), samples)
+    with pytest.raises(SilentChannelsError, match="every channel"):
+        open_sound(files, 4)
+
+
+def test_missing_lossy_short_and_empty_sound_and_other_channels_are_refused(tmp_path: Path) -> None:
+    refused("no such file", tmp_path / "no.wav")
+    refused("found a folder", tmp_path)
+    refused("plain samples, got OGG VORBIS", write(tmp_path / "a.ogg", noise(channels=2), "OGG", "VORBIS"))
+    lossy = write(tmp_path / "a.wav", noise(channels=2), encoding="IMA_ADPCM")
+    refused("got WAV IMA_ADPCM", lossy)
+    refused("at least 1 s", write(tmp_path / "short.wav", noise(frames=RATE_HZ - 1)))
+    refused("empty", write(tmp_path / "empty.wav", noise(frames=0)))
+    other = write(tmp_path / "b.wav", noise())
+    refused("expected 56 channels, one per microphone, got 3", other, expect_channels=56)
+    descriptors = Path("/proc/self/fd")
+    opened = len(list(descriptors.iterdir())) if descriptors.is_dir() else 0
+    for _ in range(20):  # A refused file is closed again
+        refused("channels", other, expect_channels=5)
+    assert not opened or len(list(descriptors.iterdir())) <= opened
+
+
+@pytest.mark.parametrize("data", [b"", b"RIFF", b"hello, world" * 100, b"RIFF\0\0\0\0WAVE", bytes(5000)])
+def test_other_bytes_are_no_sound(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "a.wav").write_bytes(data)
+    refused("expected", tmp_path / "a.wav")
+
+
+@pytest.mark.parametrize("container", ["WAV", "WAVEX", "RF64", "W64", "FLAC"])
+@pytest.mark.parametrize("kept", [0.999, 0.9, 0.5])
+def test_truncated_sound(tmp_path: Path, container: str, kept: float) -> None:
+    name = write(tmp_path / "cut", noise(12_000), container)
+    name.write_bytes(name.read_bytes()[: int(kept * name.stat().st_size)])
+    refused("cut short", name)
+
+
+@pytest.mark.parametrize("container", ["WAV", "RF64", "W64", "FLAC"])
+@given(cut=st.integers(0, 400), seed=st.integers(0, 10_000))
+@settings(max_examples=40, deadline=None)
+def test_a_cut_header_is_refused_and_a_damaged_one_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, container: str, cut: int, seed: int
+) -> None:
+    name, rng = tmp_path_factory.mktemp("cut") / "cut", np.random.default_rng(seed)
+    data = bytearray(write(name, noise(9000), container, "PCM_16").read_bytes())
+    name.write_bytes(data[:cut])
+    refused("expected", name)
+    for position in rng.integers(0, 120, 4):
+        data[position] = rng.integers(0, 256)
+    name.write_bytes(data)
+    try:
+        heard(name)
+    except InputFileError as error:
+        assert str(name) in str(error)
+
+
+def test_silent_channels(tmp_path: Path) -> None:
+    samples = noise(12_000, 4)
+    samples[:RATE_HZ, [0, 2]] = [0.0, 0.25]
+    refused("on channel 1, 3$", write(tmp_path / "a.wav", samples))
+    samples[RATE_HZ - 1, [0, 2]] = 0.1
+    with open_audio(write(tmp_path / "b.wav", samples)) as source:
+        assert source.channels == 4
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_samples_that_are_no_numbers(tmp_path: Path, value: float) -> None:
+    for sample, encoding, read in ((50, "FLOAT", open_audio), (9000, "DOUBLE", heard)):
+        samples = noise(12_000, 4).astype(float)
+        samples[sample, 1] = value
+        name = write(tmp_path / "a.wav", samples, encoding=encoding)
+        refused(rf"expected finite samples, got \S+ in channel 2, sample {sample}$", name, read)
+
+
+# arecord, SoX and ffmpeg; the last of each pair is rounded to whole samples of three channels.
+OPEN_SIZES = (0, 0x80000000, 0x7FFFFFFE, 0x7FFFFF00, 0x7FFFF000, 0xFFFFFFFF, 0xFFFFFFFC, 0xFFFFF000)
 
 
 def size_at(data: bytes, container: str) -> tuple[int, str]:
@@ -43,11 +182,6 @@ def with_size(path: Path, container: str, size: int, subtype: str = "PCM_16", ta
     data[:4] = b"BW64" if container == "BW64" else data[:4]
     path.write_bytes(data)
     return path
-
-
-def heard(path: Path) -> np.ndarray:
-    with open_audio(path) as source:
-        return np.concatenate(list(source.blocks(1000)))
 
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24", "FLOAT"])
