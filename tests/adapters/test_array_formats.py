@@ -1,11 +1,12 @@
-"""Array files of users: all forms give the same positions, and ambiguous files raise an error."""
+"""Array files of users: all forms give the same positions; ambiguous and damaged files raise an error."""
 
 import json
-import logging
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from worldstate.adapters.files.array_file import named_arrays, read_array, write_array_xml
 from worldstate.adapters.vehicle.car_file import read_car
@@ -30,8 +31,6 @@ SAME = {
     + "".join(f'<pos x="{-y}" y="{z}" z="{x}"/>' for x, y, z in PLACES)
     + "</MicArray>",
 }
-
-
 SAME |= {
     "millimetres.csv": "x_mm,y_mm,z_mm\n500,200,1400\n500,-200,1400\n100,0,1500\n",
     "centimetres.csv": "X [cm];Y [cm];Z [cm]\n50;20;140\n50;-20;140\n10;0;150\n",
@@ -77,54 +76,101 @@ def test_a_configuration_of_odas_has_channels(tmp_path: Path) -> None:
     assert read_array(tmp_path / "odas.cfg").channels == (2, 4, 3)
 
 
-CONTRADICTED = {
-    "a gain": ("0.05,0,0,1.0\n0,0.05,0,0.9\n-0.05,0,0,1.1\n0,-0.05,0,0.95\n", "4 numbers per line"),
-    "index or height": ("1,0,0,5\n2,0,0,6\n3,0,0,7\n4,0,0,8\n", "4 numbers per line"),
-    "five numbers": ("0,0.05,0,0,1\n1,0,0.05,0,1\n2,-0.05,0,0,1\n", "5 numbers per line"),
-    "3 x 4": ("0.05 0 -0.05 0\n0 0.05 0 -0.05\n0 0 0 0\n", "write its transpose"),
-    "3 x 8": ("\n".join([",".join(["0.1"] * 8)] * 3), "write its transpose"),
-    "3 x 4 in JSON": (json.dumps([[0.1, 0, -0.1, 0], [0, 0.1, 0, -0.1], [0] * 4]), "write its transpose"),
-    "millimetres": ("50,0,0\n0,50,0\n-50,0,0\n", "millimetres? Then a header x_mm"),
-    "centimetres": ("5,0,0\n0,5,0\n-5,0,0\n", "centimetres? Then a header x_mm"),
-    "two units": ("x_mm,y_mm,z\n1,2,3\n2,3,4\n", "one unit of x, y and z, got m, mm"),
-    "two lists": (json.dumps({"positions_m": PLACES, "positions_mm": PLACES}), "its unit in its name"),
-    "a unit of its own": (json.dumps({"positions_m": PLACES, "unit": "mm"}), "its unit in its name"),
-    "inches by name": ("x_in,y_in,z_in\n2,0,0\n0,2,0\n", "columns x, y, z"),
-    "angles": ("azimuth,elevation,radius\n0,0,0.05\n90,0,0.05\n", "columns x, y, z"),
-    "a matrix of MATLAB": ("mics = [0.05 0 0; 0 0.05 0];\n", "writematrix"),
-    "a file of MATLAB": (b"MATLAB 5.0 MAT-file\0\0", "writematrix"),
-    "an included file": ('@include "mics.cfg"\ngeneral: { };', "replace @include by the content"),
-    "included microphones": ('mics = (\n@include "mics.inc"\n);', "replace @include by the content"),
-    "commas": ("x;y;z\n0,05;0,00;0,00\n0,00;0,05;0,00\n", "decimal commas"),
-    "commas and tabs": ("0,05\t0\t0\n0\t0,05\t0\n", "decimal commas"),
-    "commas and blanks": ("1 0,05 0 -0,1\n2 0 0,05 0\n", "decimal commas"),
-    "NumPy's own": (b"\x93NUMPY\x01\x00v\x00", "numpy.savetxt"),
-    "odas without places": ("mics = ( { mu = ( 0, 0 ); }, { mu = ( 0, 0, 1 ); } );", "as in ODAS"),
-    "odas without end": ("mics = ( { mu = ( 0, 0, 0 ); }, { mu = ( 0, 0, 1 ); }", "as in ODAS"),
-    "odas without mu": ("mics = ( { mu = ( 0, 1, 0 ); }, { angle = ( 0, 0 ); } );", "as in ODAS"),
-    "odas with an expression": (
-        "mics = ( { mu = ( 0, 1, exit ); }, { mu = ( 0, 0, 1 ); } );",
-        "got ' exit '",
-    ),
-    "odas with a channel beyond": (ODAS.replace("MAP", "1, 2, " + "9" * 5000), "channels"),
-    "odas with too many channels": (ODAS.replace("MAP", "1, 2, 3, 4"), "channels: expected 3 different"),
-    **{
-        f"channels {one}": (
-            json.dumps({"positions_m": PLACES, "channels": one}),
-            "channels: expected 3 different",
-        )
+def expect(problem: str, path: Path) -> None:
+    with pytest.raises(InputFileError, match=problem) as raised:
+        read_array(path)
+    assert str(raised.value).startswith(f"{path}: ") and "\n" not in str(raised.value)
+
+
+POS = '<pos Name="Point {0}" x="0.{0}" y="0" z="0"/>'
+TWO = POS.format(1) + POS.format(2)
+BOMB = '<!DOCTYPE m [<!ENTITY a "1"><!ENTITY b "&a;&a;">]><MicArray>{}<pos x="&b;" y="0" z="0"/></MicArray>'
+EXTERNAL = '<!DOCTYPE m [<!ENTITY a SYSTEM "file:///etc/hostname">]><MicArray>&a;{}</MicArray>'
+
+
+REFUSED: list[tuple[str | bytes, str]] = [
+    ("0.05,0,0,1.0\n0,0.05,0,0.9\n-0.05,0,0,1.1\n0,-0.05,0,0.95\n", "4 numbers per line"),
+    ("1,0,0,5\n2,0,0,6\n3,0,0,7\n4,0,0,8\n", "4 numbers per line"),
+    ("0,0.05,0,0,1\n1,0,0.05,0,1\n2,-0.05,0,0,1\n", "5 numbers per line"),
+    ("0.05 0 -0.05 0\n0 0.05 0 -0.05\n0 0 0 0\n", "write its transpose"),
+    ("\n".join([",".join(["0.1"] * 8)] * 3), "write its transpose"),
+    (json.dumps([[0.1, 0, -0.1, 0], [0, 0.1, 0, -0.1], [0] * 4]), "write its transpose"),
+    ("50,0,0\n0,50,0\n-50,0,0\n", r"millimetres\? Then a header x_mm"),
+    ("5,0,0\n0,5,0\n-5,0,0\n", r"centimetres\? Then a header x_mm"),
+    ("x_mm,y_mm,z\n1,2,3\n2,3,4\n", "one unit of x, y and z, got m, mm"),
+    (json.dumps({"positions_m": PLACES, "positions_mm": PLACES}), "its unit in its name"),
+    (json.dumps({"positions_m": PLACES, "unit": "mm"}), "its unit in its name"),
+    ("x_in,y_in,z_in\n2,0,0\n0,2,0\n", "columns x, y, z"),
+    ("azimuth,elevation,radius\n0,0,0.05\n90,0,0.05\n", "columns x, y, z"),
+    ("mics = [0.05 0 0; 0 0.05 0];\n", "writematrix"),
+    (b"MATLAB 5.0 MAT-file\0\0", "writematrix"),
+    ('@include "mics.cfg"\ngeneral: { };', "replace @include by the content"),
+    ('mics = (\n@include "mics.inc"\n);', "replace @include by the content"),
+    ("x;y;z\n0,05;0,00;0,00\n0,00;0,05;0,00\n", "expected decimal points, got decimal commas"),
+    ("0,05\t0\t0\n0\t0,05\t0\n", "decimal commas"),
+    ("1 0,05 0 -0,1\n2 0 0,05 0\n", "decimal commas"),
+    (b"\x93NUMPY\x01\x00v\x00", "numpy.savetxt"),
+    ("mics = ( { mu = ( 0, 0 ); }, { mu = ( 0, 0, 1 ); } );", "as in ODAS"),
+    ("mics = ( { mu = ( 0, 0, 0 ); }, { mu = ( 0, 0, 1 ); }", "as in ODAS"),
+    ("mics = ( { mu = ( 0, 1, 0 ); }, { angle = ( 0, 0 ); } );", "as in ODAS"),
+    ("mics = ( { mu = ( 0, 1, exit ); }, { mu = ( 0, 0, 1 ); } );", "got ' exit '"),
+    (ODAS.replace("MAP", "1, 2, " + "9" * 5000), "channels"),
+    (ODAS.replace("MAP", "1, 2, 3, 4"), "channels: expected 3 different"),
+    *(
+        (json.dumps({"positions_m": PLACES, "channels": one}), "channels: expected 3 different")
         for one in ([2, 3], [2, 2, 3], [0, 1, 2], [1, 2, 3.0], "2-4")
-    },
-}
+    ),
+    (BOMB.format(TWO), "entities, which are refused"),
+    (EXTERNAL.format(TWO), "entities, which are refused"),
+    ('<!DOCTYPE MicArray SYSTEM "a.dtd"><MicArray/>', "refused"),
+    ("", "as XML, JSON or CSV"),
+    ("name,left,right\na,0,0", "columns x, y, z"),
+    ("0,0.1,0\n0,0.2\n", "microphone 2: .* finite number as z, got None"),
+    ("0,0,0\n0,0,0.5\n", "vertical line"),
+    ("0,-10,0\n0,0,0\n0,10,0\n", "centimetres"),
+    ("0,1e-5,0\n0,0,0\n", "expected positions in metres"),
+    ("0,0.1,0\n0,0.2,0\n0,0.200000001,0\n", "microphones 2 and 3 1e-09 m apart"),
+    ("0,0.1,0\n0,0.1,0\n", "microphones 1 and 2 0 m apart"),
+    ("[[0, 0.1, 0], [0, -0.1]]", "positions"),
+    ("[[0, 0.1, 0], [0, -0.1, true]]", "microphone 2: .* finite number as z, got True"),
+    ("[[0, 0.1, 0], [0, -0.1, NaN]]", "microphone 2"),
+    ('{"positions_m": [[0, 0.1, 0], [0, 1, 0]], "axes": "ned"}', "axes: expected acoular or base_link"),
+    ('{"positions": []}', "positions_m"),
+    ("[" * 100_000, "does not parse"),
+    ("<MicArray>" + TWO, "does not parse"),
+    ("<MicArray/>", "expected 2 to 1024"),
+    (f"<MicArray>{POS.format(1)}</MicArray>", "got 1"),
+    (f"<MicArray>{TWO}<pos x='1' y='0'/></MicArray>", "microphone 3: .* finite number as z, got None"),
+    (f"<MicArray>{TWO}<pos x='1,5' y='0' z='0'/></MicArray>", "microphone 3: .* finite number as x"),
+    (f"<MicArray>{TWO}<pos x='nan' y='0' z='0'/></MicArray>", "microphone 3"),
+    (f"<MicArray>{TWO}<pos x='1' y='inf' z='0'/></MicArray>", "microphone 3"),
+    (f"<MicArray>{TWO}<pos x='390' y='0' z='0'/></MicArray>", "millimetres"),
+    (f"<MicArray>{POS.format(1) * 2}</MicArray>", "microphones 1 and 2 0 m apart"),
+    ("<MicArray>" + TWO * 513 + "</MicArray>", "got 1026"),
+    ("<?xml version='1.0' encoding='klingon'?><MicArray/>", "does not parse"),
+]
 
 
-@pytest.mark.parametrize("case", CONTRADICTED)
-def test_ambiguous_numbers_are_refused_with_a_remedy(case: str, tmp_path: Path) -> None:
-    text, said = CONTRADICTED[case]
+@pytest.mark.parametrize(("text", "problem"), REFUSED)
+def test_ambiguous_and_damaged_arrays_are_refused(text: str | bytes, problem: str, tmp_path: Path) -> None:
     (tmp_path / "mics").write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(InputFileError) as refused:
-        read_array(tmp_path / "mics")
-    assert said in str(refused.value)
+    expect(problem, tmp_path / "mics")
+
+
+def test_missing_and_huge_arrays(tmp_path: Path) -> None:
+    expect("No such file", tmp_path / "no.xml")
+    expect("array file", tmp_path)
+    (tmp_path / "big.xml").write_bytes(b"<MicArray>" + b" " * (1 << 20) + b"</MicArray>")
+    expect("at most", tmp_path / "big.xml")
+
+
+@given(data=st.binary(max_size=300))
+@settings(max_examples=60, deadline=None)
+def test_any_bytes_as_an_array(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+    name = tmp_path_factory.mktemp("xml") / "mics.xml"
+    name.write_bytes(data)
+    with pytest.raises(InputFileError):
+        read_array(name)
 
 
 @pytest.mark.parametrize(("radius_m", "said"), [(0.05, False), (0.6, False), (1.5, True), (2.0, True)])
@@ -154,12 +200,10 @@ def test_microphones_sorted_as_text_are_ordered_by_number(
 
 
 def test_a_possible_transpose_logs_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for rows, said in (([[0.1, 0.0, -0.1], [0.0, 0.1, 0.0], [1.4] * 3], True), (PLACES, False)):
+    for rows, said in ((PLACES, False), ([[0.1, 0.0, -0.1], [0.0, 0.1, 0.0], [1.4] * 3], True)):
         (tmp_path / "mics.json").write_text(json.dumps(rows))
-        with caplog.at_level(logging.WARNING):
-            assert read_array(tmp_path / "mics.json").n_microphones == 3
+        assert read_array(tmp_path / "mics.json").n_microphones == 3
         assert ("write its transpose" in caplog.text) is said
-        caplog.clear()
 
 
 def test_axes_may_be_those_of_the_other_convention(tmp_path: Path) -> None:
@@ -181,23 +225,25 @@ def test_the_description_shows_an_array_along_the_vehicle() -> None:
     assert "no extent across the vehicle" in stance(sideways)
 
 
+def pair(spacing_m: float) -> MicrophoneArray:
+    return MicrophoneArray([[0, spacing_m, 0], [0, 0, 0]])
+
+
 @pytest.mark.parametrize(
-    ("spacing_m", "rate_hz", "band_hz"),
+    ("array", "rate_hz", "band_hz"),
     [
-        (0.5, 48_000, (300, 1800)),
-        (0.088, 48_000, (300, 1800)),
-        (0.0419, 48_000, (600, 3600)),
-        (0.01, 48_000, (1200, 7200)),
-        (0.01, 8_000, (600, 3600)),
+        (pair(0.5), 48_000, (300, 1800)),
+        (pair(0.088), 48_000, (300, 1800)),
+        (pair(0.0419), 48_000, (600, 3600)),
+        (pair(0.01), 48_000, (1200, 7200)),
+        (pair(0.01), 8_000, (600, 3600)),
+        (roof_array_56(), 47_998, (300.0, 1800.0)),  # Exactly the paper's band
     ],
 )
-def test_the_band_follows_the_spacing(spacing_m: float, rate_hz: float, band_hz: tuple[float, float]) -> None:
-    pair = MicrophoneArray([[0, spacing_m, 0], [0, 0, 0]])
-    assert default_band_hz(pair, rate_hz) == band_hz
-
-
-def test_the_roof_keeps_the_papers_band_exactly() -> None:
-    assert default_band_hz(roof_array_56(), 47_998) == (300.0, 1800.0)
+def test_the_band_follows_the_spacing(
+    array: MicrophoneArray, rate_hz: float, band_hz: tuple[float, float]
+) -> None:
+    assert default_band_hz(array, rate_hz) == band_hz
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,7 @@ from worldstate.adapters.camera.detections import (
     DetectionFilter,
     DetectionFrame,
     DetectionLog,
-    coco_log,
     count_boxes,
-    read_yolo_text,
     told_counts,
 )
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -107,26 +105,6 @@ def test_an_unknown_class_is_no_absence(name: str) -> None:
     assert isinstance(said, Unqueried) and boxes == ()
     assert isinstance(look.answer, Unqueried) and look.fault == NONE_COUNTS  # type: ignore[attr-defined]
     assert isinstance(answers(moving(name), DetectionFilter({name.upper()}))[0], Present)
-
-
-def test_class_numbers_follow_the_file_format(tmp_path) -> None:
-    rows = [{"image_id": 0, "category_id": k, "bbox": [0, 0, 9, 9], "score": 0.9} for k in (3, 8, 10, 90, 95)]
-    labels = coco_log(tmp_path, rows).frames[0].labels
-    assert labels == ("car", "truck", "traffic light", "toothbrush", "95")
-    # Numbers from 0, and ambiguous numbers, which give no known class.
-    for used, expected in (((0, 2, 7), ["person", "car", "truck"]), ((1, 2, 5), ["person", None, None])):
-        labels = coco_log(tmp_path, [{**rows[0], "category_id": k} for k in used]).frames[0].labels
-        assert [name if class_name(name) in CLASSES else None for name in labels] == expected
-        assert all(may_be(class_name(name), {"car"}) for name in labels[1:])
-    assert coco_log(tmp_path, [{**rows[0], "category_id": "Van"}]).frames[0].labels == ("Van",)
-    line = "{} 0.5 0.5 0.1 0.2 0.9"
-    (tmp_path / "000000.txt").write_text("\n".join(line.format(k) for k in (2, 7, 9, 79, 80)))
-    labels = read_yolo_text(tmp_path, (640, 480)).frames[0].labels
-    assert labels == ("car", "truck", "traffic light", "toothbrush", "80")
-    (tmp_path / "classes.txt").write_text("Van\r\nPedestrian\r\nMisc\r\n")
-    (tmp_path / "000000.txt").write_text("\n".join(line.format(k) for k in (0, 1, 2)))
-    labels = read_yolo_text(tmp_path, (640, 480)).frames[0].labels
-    assert [class_name(one) for one in labels] == ["car", "person", "misc"]
 
 
 @given(st.sampled_from([(a, b) for _, a, one in NAMED for _, b, other in NAMED if one and one == other]))
@@ -230,14 +208,6 @@ def test_boxes_of_another_scale_are_no_absence() -> None:
             VisionQuery(CAMERA, None).see(AT_NS, parts.frames[20])
     # In images of a quarter of the size the box is at another position.
     assert isinstance(answers(scaled(moving("car"), 0.25))[0], Unqueried)
-
-
-@pytest.mark.parametrize("size_px", [(640, 402), (1280, 720), (1936, 1217), (3840, 2412)])
-def test_listed_images_must_have_the_size_of_the_camera(size_px: tuple[int, int], tmp_path) -> None:
-    listed = {"images": [{"id": 0, "width": size_px[0], "height": size_px[1]}], "annotations": []}
-    assert len(coco_log(tmp_path, listed, size_px=size_px)) == 1
-    with pytest.raises(InputFileError, match=f"got {size_px[0]} x {size_px[1]}: width_px and height_px"):
-        coco_log(tmp_path, listed, size_px=(1936, 1216))
 
 
 @pytest.mark.parametrize("label", ["car", "truck"])

@@ -18,7 +18,6 @@ from worldstate.adapters.camera.detections import (
     DetectionFrame,
     DetectionLog,
     count_boxes,
-    read_any_detections,
 )
 from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
@@ -140,28 +139,6 @@ def test_images_without_time_stamps_have_the_rate_of_the_camera(tmp_path):
     assert (reported(image_rate_hz=30), reported()) == (1_500_000_000, 4_500_000_000)
     with pytest.raises(InputFileError, match=r"camera\.image_rate_hz"):
         reported(image_rate_hz=0)
-
-
-def test_images_that_a_detector_found_empty_are_looks(tmp_path):
-    boxes = [RESULT | {"image_id": 2}]
-    images = [{"id": number, "file_name": f"{number}.jpg"} for number in (0, 2, 3)]
-    results, coco = tmp_path / "results.json", tmp_path / "coco.json"
-
-    def found(document, path=results, n_images=None):
-        path.write_text(json.dumps(document))
-        return [len(frame) for frame in read_any_detections(path, n_images=n_images).frames]
-
-    # The results do not show that image 3 was searched.
-    assert found(boxes) == found({"annotations": boxes}) == [0, 0, 1]
-    assert found([]) == [] and found([], n_images=30) == [0] * 30
-    assert found(boxes, n_images=5) == [0, 0, 1, 0, 0]
-    assert found({"images": images, "annotations": boxes}, coco) == [0, 1, 0]
-    assert read_any_detections(coco).stamps_ns.tolist() == [0, 200_000_000, 300_000_000]
-    for path, more in ((results, 2), (coco, 5)):
-        with pytest.raises(InputFileError, match="images"):
-            read_any_detections(path, n_images=more)
-    with pytest.raises(InputFileError, match="images of all boxes listed, 2 is not"):
-        found({"images": images[:1], "annotations": boxes})
 
 
 def test_an_undescribed_camera_is_refused_beside_another_array(tmp_path):

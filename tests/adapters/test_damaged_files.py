@@ -16,6 +16,7 @@ import numpy as np
 import onnx
 import pytest
 import zstandard
+from camera_boxes import write_onnx
 from damaged_files import RATE_HZ, spoilt, write_inputs
 
 from worldstate.adapters.audio.sound_file import open_audio, open_sound
@@ -96,25 +97,9 @@ READERS: dict[str, Callable[[Path], object]] = {
 def whole(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("whole")
     write_inputs(folder)
-    write_detector(folder / "detector.onnx")
+    # A model that finds one car in every image.
+    write_onnx(folder / "detector.onnx", np.array([[[16.0], [16.0], [20.0], [10.0], [0.9]]]))
     return folder
-
-
-def write_detector(path: Path) -> None:
-    """Write a model that finds one car in every image."""
-    make, kind = onnx.helper, onnx.TensorProto.FLOAT
-    image = make.make_tensor_value_info("images", kind, [1, 3, 32, 32])
-    result = make.make_tensor_value_info("output0", kind, [1, 5, 1])
-    car = np.array([[[16.0], [16.0], [20.0], [10.0], [0.9]]], np.float32)
-    none = onnx.numpy_helper.from_array(np.zeros(1, np.float32), "none")
-    nodes = [
-        make.make_node("ReduceMean", ["images"], ["mean"], keepdims=0),
-        make.make_node("Mul", ["mean", "none"], ["zero"]),
-        make.make_node("Add", ["car", "zero"], ["output0"]),
-    ]
-    given = [none, onnx.numpy_helper.from_array(car, "car")]
-    graph = make.make_graph(nodes, "fixed", [image], [result], given)
-    onnx.save(make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8), path)
 
 
 def read_each(name: str, folder: Path, seeds: range) -> int:

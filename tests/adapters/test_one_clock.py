@@ -1,7 +1,7 @@
 """Data beside the sound must be on its clock; otherwise an error gives the remedy."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import soundfile
-from hypothesis import given
-from hypothesis import strategies as st
 
 from worldstate import Listener
 from worldstate.abduction.co_evidence import Absent
@@ -247,151 +245,6 @@ def test_the_rate_is_a_key_of_the_camera(sound: Path, tmp_path: Path) -> None:
     stamped = [EMPTY | {"stamp_ns": 10**8 * i} for i in range(9)]
     (tmp_path / "ovad.json").write_text(json.dumps({"detections_per_frame": stamped}))
     assert read(tmp_path / "c.json") == (None, False)
-
-
-# Names of label files of exporters with the times of the images in 0.1 s; None if the order is ambiguous.
-NAMES: dict[str, tuple[Sequence[str], Sequence[int] | None]] = {
-    "one name and a number": (("street_0", "street_1", "street_3"), (0, 1, 2, 3)),
-    "numbers alone": (("000000", "000001", "000002"), (0, 1, 2)),
-    "without leading zeros": (("f8", "f9", "f10"), range(11)),
-    "Roboflow": ([f"cam_000{i}_jpg.rf.{n}" for i, n in ((1, "4f1e77"), (2, "08c5"), (3, "1"))], (0, 1, 2)),
-    "Roboflow, of other images": (
-        [f"{i:04d}_{kind}.rf.0{i}" for i, kind in ((1, "webp"), (2, "JPG"), (4, "tiff"))],
-        (1, 2, 4),
-    ),
-    "Roboflow, of a part": ([f"cam_{i:04d}_png.rf.{n}" for i, n in ((3, "4f1e"), (5, "08c5"))], (3, 5)),
-    "hashes": (("4f1e77aa0b3c", "08c5d2219e71"), None),
-    "two cameras": (("left_0001", "right_0001"), None),
-    "dates": (("2024-05-01_10-00-00", "2024-05-01_10-00-01", "2024-05-01_10-01-00"), None),
-    "nanoseconds": (("1700000000000000000", "1700000000100000000"), None),
-    "milliseconds of the epoch": (("1700000000000", "1700000000100", "1700000000200"), None),
-    "seconds and milliseconds": (("1700000000.100", "1700000000.200", "1700000000.300"), None),
-    "milliseconds": (("000000", "000100", "000200"), None),
-    "every third": (("frame_0", "frame_3", "frame_6", "frame_9"), None),
-    "no number": (("first", "second"), None),
-    "one number twice": (("a_01", "a_1"), None),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_names_of_label_files_give_times_only_for_sequences(tmp_path: Path, name: str) -> None:
-    names, expected = NAMES[name]
-    for one in names:
-        (tmp_path / f"{one}.txt").write_text("2 0.5 0.5 0.1 0.2 0.9\n")
-    if expected is None:
-        with pytest.raises(InputFileError, match=r"image_rate_hz|file_name|stamp_ns"):
-            read_any_detections(tmp_path, size_px=(640, 480))
-        return
-    log = read_any_detections(tmp_path, size_px=(640, 480))
-    assert [stamp // 10**8 for stamp in log.stamps_ns.tolist()] == [*expected]
-    assert sum(map(len, log.frames)) == len(names)
-
-
-def test_a_stated_rate_allows_every_third_image(tmp_path: Path) -> None:
-    for i in (0, 3, 9, 12):
-        (tmp_path / f"frame_{i}.txt").write_text("2 0.5 0.5 0.1 0.2 0.9\n")
-    log = read_any_detections(tmp_path, 30.0, (640, 480))
-    assert [len(frame) for frame in log.frames] == [1, 1, 0, 1, 1]
-    assert log.stamps_ns.tolist() == [0, 100_000_000, 200_000_000, 300_000_000, 400_000_000]
-
-
-def test_a_folder_with_empty_files_has_a_file_for_every_image(tmp_path: Path) -> None:
-    for i, text in enumerate(("2 0.5 0.5 0.1 0.2 0.9\n", "", "", "2 0.5 0.5 0.1 0.2 0.9\n")):
-        (tmp_path / f"frame_{i * i:02d}.txt").write_text(text)
-    log = read_any_detections(tmp_path, size_px=(640, 480))
-    assert (log.stamps_ns // 10**8).tolist() == [0, 1, 4, 9]
-
-
-FRAMES = [f"frame_{i:04d}.jpg" for i in range(20)]
-# Ids and file names of listed images, and their times in 0.1 s.
-LISTED: dict[str, tuple[Sequence[int | str], Sequence[str | None], Sequence[int]]] = {
-    "from 0": (range(4), [None] * 4, range(4)),
-    "from 0, some": ((0, 2, 3), [None] * 3, (0, 2, 3)),
-    "from 1": (range(1, 5), [None] * 4, range(4)),
-    "from 1, named": (range(1, 5), FRAMES[:4], range(4)),
-    "from 1, named from 1": (range(1, 5), FRAMES[1:5], range(4)),
-    "from 1, listed backwards": (range(1, 5), FRAMES[3::-1], (3, 2, 1, 0)),
-    "arbitrary": ((4711, 13, 99, 500_000), FRAMES[:4], range(4)),
-    "arbitrary, in another order": ((1, 700, 3), [FRAMES[2], FRAMES[0], FRAMES[1]], (2, 0, 1)),
-    "arbitrary, cut from a longer video": ((7, 9, 8), FRAMES[10:13], range(3)),
-    "arbitrary, some of a video": ((7, 9, 8), (FRAMES[0], FRAMES[4], FRAMES[9]), (0, 4, 9)),
-    "named by times": ((3, 2, 1), ("1700000000.jpg", "1700000012.jpg", "1700000025.jpg"), range(3)),
-    "ids are names": ([name[:10] for name in FRAMES[:4]], [None] * 4, range(4)),
-    "ids are names of a part": (("v_0", "v_7", "v_3"), [None] * 3, (0, 7, 3)),
-    "ids are numbers as text": (("1", "2", "3"), [None] * 3, range(3)),
-    "ids are hashes": (("0a1f", "93bc", "77ee"), FRAMES[:3], range(3)),
-    "Roboflow": ((5, 6), ("a_0002_jpg.rf.ff.jpg", "a_0001_jpg.rf.0e.jpg"), (1, 0)),
-}
-
-
-@pytest.mark.parametrize("name", LISTED)
-def test_listed_images_are_ordered_by_name(tmp_path: Path, name: str) -> None:
-    ids, names, expected = LISTED[name]
-    images = [{"id": i} | ({} if n is None else {"file_name": n}) for i, n in zip(ids, names, strict=True)]
-    # The left edge of a box identifies its image.
-    boxes = [
-        {"image_id": i, "category_id": 3, "bbox": [place, 0, 9, 9], "score": 0.9}
-        for place, i in enumerate(ids)
-    ]
-    (tmp_path / "coco.json").write_text(json.dumps({"images": images, "annotations": boxes}))
-    log = read_any_detections(tmp_path / "coco.json")
-    places = [int(frame.boxes_px[0, 0]) for frame in log.frames]
-    taken = dict(zip(places, (log.stamps_ns // 10**8).tolist(), strict=True))
-    assert [taken[place] for place in range(len(ids))] == [*expected]
-
-
-@pytest.mark.parametrize(
-    "ids", [("0a1f", "93bc"), ("left_1", "right_1"), (-1, -2), (1700000000000000000, 1700000000100000000)]
-)
-def test_ids_without_an_order_are_refused_with_a_remedy(tmp_path: Path, ids: tuple[object, ...]) -> None:
-    boxes = [{"image_id": i, "category_id": 3, "bbox": [0, 0, 9, 9], "score": 0.9} for i in ids]
-    for written in (boxes, {"images": [{"id": i} for i in ids], "annotations": boxes}):
-        (tmp_path / "c.json").write_text(json.dumps(written))
-        with pytest.raises(InputFileError, match=r'"file_name"|"stamp_ns"'):
-            read_any_detections(tmp_path / "c.json")
-
-
-def test_results_may_name_their_images(tmp_path: Path) -> None:
-    boxes = [
-        {"image_id": f"street_{i}", "category_id": 3, "bbox": [i, 0, 9, 9], "score": 0.9} for i in (3, 0, 13)
-    ]
-    (tmp_path / "c.json").write_text(json.dumps(boxes))
-    log = read_any_detections(tmp_path / "c.json", 10.0)
-    assert [i for i, frame in enumerate(log.frames) if len(frame)] == [0, 3, 13]
-
-
-@pytest.mark.parametrize("name", ["timestamp", "stamp", "time_s", "timestamp_ms"])
-def test_times_with_another_key_are_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / "d.json").write_text(json.dumps({"detections_per_frame": [EMPTY | {name: 1.7e9}] * 9}))
-    with pytest.raises(InputFileError, match=f'"stamp_ns", whole nanoseconds, got .*{name}'):
-        read_any_detections(tmp_path / "d.json")
-
-
-def test_boxes_without_scores_have_score_one_and_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    box = {"image_id": 0, "category_id": 3, "bbox": [0, 0, 9, 9]}
-    (tmp_path / "c.json").write_text(json.dumps([box, box | {"score": 0.25}, box | {"score": None}]))
-    assert read_any_detections(tmp_path / "c.json").frames[0].scores.tolist() == [1.0, 0.25, 1.0]
-    assert "2 boxes without a score count with 1.0" in caplog.text
-
-
-@given(stamps=st.lists(st.integers(0, 9), min_size=1, max_size=12))
-def test_images_and_odometry_are_sorted_and_the_last_duplicate_counts(
-    stamps: list[int], tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.getbasetemp()
-    frames = [
-        BOX | {"scores": [place / 100], "stamp_ns": stamp * 10**8} for place, stamp in enumerate(stamps)
-    ]
-    (folder / "d.json").write_text(json.dumps({"detections_per_frame": frames}))
-    lines = (f"{stamp / 10},{place}\n" for place, stamp in enumerate(stamps))
-    (folder / "o.csv").write_text("time_s,speed_mps\n" + "".join(lines))
-    last = {stamp: place for place, stamp in enumerate(stamps)}
-    log, told = read_any_detections(folder / "d.json"), read_odometry(folder / "o.csv").told
-    assert (log.stamps_ns // 10**8).tolist() == sorted(last) == [one.stamp_ns // 10**8 for one in told]
-    assert [round(100 * frame.scores[0]) for frame in log.frames] == [last[stamp] for stamp in sorted(last)]
-    assert [one.speed_mps for one in told] == [last[stamp] for stamp in sorted(last)]
 
 
 NOISE = np.random.default_rng(0).uniform(-0.01, 0.01, (4800, 56))
