@@ -31,7 +31,6 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 SIZE = {"width_px": 1000, "height_px": 600, "position_m": [0, 0, 0]}
-RESULT = {"image_id": 0, "category_id": 3, "bbox": [10, 20, 200, 150], "score": 0.9}
 
 
 def lens(path, **keys):
@@ -125,20 +124,6 @@ def test_run_prints_the_number_of_boxes_that_count(watched, tmp_path, capsys):
     assert main(words) == 0 and "each image has a box" in capsys.readouterr().err
     (tmp_path / "d.json").write_text("[]")
     assert main(words) == 0 and "searched no image" in capsys.readouterr().err
-
-
-def test_images_without_time_stamps_have_the_rate_of_the_camera(tmp_path):
-    (tmp_path / "boxes.json").write_text(json.dumps([RESULT | {"image_id": 45}]))
-    soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).uniform(-0.01, 0.01, (240_000, 56)), 48_000)
-
-    def reported(**keys) -> int:
-        (tmp_path / "camera.json").write_text(json.dumps(LENS | keys))
-        beside = {"detections": tmp_path / "boxes.json", "camera": tmp_path / "camera.json"}
-        return int(open_source(tmp_path / "a.wav", **beside).detections.stamps_ns[45])
-
-    assert (reported(image_rate_hz=30), reported()) == (1_500_000_000, 4_500_000_000)
-    with pytest.raises(InputFileError, match=r"camera\.image_rate_hz"):
-        reported(image_rate_hz=0)
 
 
 def test_an_undescribed_camera_is_refused_beside_another_array(tmp_path):
