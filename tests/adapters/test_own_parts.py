@@ -1,39 +1,52 @@
-"""Plug-ins: the example package is installed and its parts are used on the command line."""
+"""Plug-ins on the command line, and the examples of a loop of the user's own and of NanoDet."""
 
 import csv
+import importlib.util
 import json
+import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
+from camera_boxes import write_video
+from made_up_sound import plane_wave
 from scripted_states import scripted_states
 
 from worldstate.adapters import AcousticAdapter, write_array_xml
+from worldstate.adapters.camera.box_linking import overlaps
+from worldstate.adapters.camera.detections import Detector
+from worldstate.adapters.camera.video import open_video
 from worldstate.adapters.live.live_sensors import ImageLooks, image_channel
 from worldstate.adapters.own_parts import OwnDetector, installed, of_part
+from worldstate.belief.street_model import StreetModel
 from worldstate.cli.main import main
-from worldstate.ground.errors import OwnPartError
+from worldstate.ground.errors import InputFileError, OwnPartError
 from worldstate.ground.values import nanoseconds
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "own_parts"
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "docs" / "examples"
+
+
+def example(name):
+    """Import an example of the pages."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
     """Install the example into an empty folder."""
     target, tree = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("tree") / "own_parts"
-    shutil.copytree(EXAMPLE, tree)
+    shutil.copytree(EXAMPLES / "own_parts", tree)
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(target)]
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", "install", *options, str(tree)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = [sys.executable, "-m", "pip", "install", *options, str(tree)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return target
 
@@ -68,12 +81,9 @@ def test_an_exporter_gets_every_state(own_parts, log, tmp_path):
 @pytest.mark.long
 def test_an_own_sensor_gives_the_position_of_a_hidden_vehicle(own_parts, approach, tmp_path):
     """Messages from 2 s on place it on the left, 20 m away; the sound comes from the right."""
-    messages = [
-        {"stamp_ns": round(time_s * 1e9), "x_m": 9.0, "y_m": 30.0 - 5.0 * time_s}
-        for time_s in np.arange(2.0, 4.0, 0.1)
-    ]
     beacons, out = tmp_path / "v2x.jsonl", tmp_path / "states.jsonl"
-    beacons.write_text("".join(json.dumps(one) + "\n" for one in messages))
+    rows = [(round(s * 1e9), 30.0 - 5.0 * s) for s in np.arange(2.0, 4.0, 0.1)]
+    beacons.write_text("".join(f'{{"stamp_ns": {ns}, "x_m": 9.0, "y_m": {y}}}\n' for ns, y in rows))
     (tmp_path / "car.json").write_text('{"measurements": {"v2x": "v2x.jsonl"}}')
     assert main(["run", str(approach.folder), "--car", str(tmp_path / "car.json"), "--out", str(out)]) == 0
     after = [json.loads(line) for line in out.open()]
@@ -90,7 +100,11 @@ def test_an_own_detector_processes_the_video(own_parts, approach, tmp_path):
     folder = tmp_path / "SB1" / "right" / "3_02_0000"
     folder.mkdir(parents=True)
     (folder / "out_multi.wav").symlink_to(approach.folder / "out_multi.wav")
-    write_video(folder / "ueye_stereo_vid.mp4")
+    # A grey street with a bright moving block of 300 pixels from image 50 on.
+    images = np.full((100, 304, 968, 3), 90, np.uint8)
+    for number in range(50, 100):
+        images[number, :, 12 * (number - 50) :][:, :300] = 220
+    write_video(folder / "ueye_stereo_vid.mp4", images)
     options = ["run", str(folder), "--detector", "moving-columns", "--out", str(tmp_path / "s.jsonl")]
     assert main(options) == 0
     states = [json.loads(line) for line in (tmp_path / "s.jsonl").open()]
@@ -99,30 +113,11 @@ def test_an_own_detector_processes_the_video(own_parts, approach, tmp_path):
     assert sum(seen for stamp_ns, seen in found.items() if stamp_ns >= 5_200_000_000) > 20
 
 
-def write_video(path, frames=100):
-    """Write a grey street with a bright moving block of 300 pixels from image 50 on."""
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (968, 304))
-    for number in range(frames):
-        image = np.full((304, 968, 3), 90, np.uint8)
-        if number >= 50:
-            left = 12 * (number - 50)
-            image[:, left : left + 300] = 220
-        video.write(image)
-    video.release()
-
-
 def test_an_own_array_and_signature_give_measurements(own_parts, tmp_path):
     array = own_parts.my_array()
     write_array_xml(tmp_path / "roof.xml", array)
     adapter = AcousticAdapter(array, 16_000, own_parts.LoudSide())
-    rng = np.random.default_rng(0)
-    # A plane wave from 60 degrees to the left, in noise.
-    wave = rng.normal(size=32_000 + 64)
-    spectrum, frequency_hz = np.fft.rfft(wave), np.fft.rfftfreq(len(wave), 1 / 16_000)
-    delays_s = array.delays_s(np.pi / 3).ravel()[:, None]
-    late = np.fft.irfft(spectrum * np.exp(-2j * np.pi * frequency_hz * delays_s), len(wave)).T[:32_000]
-    block = (late + 0.05 * rng.normal(size=late.shape)).astype(np.float32)
-    measured = adapter.measure(block)
+    measured = adapter.measure(plane_wave(array, 16_000, np.pi / 3, 2.0))
     assert len(measured) == 11
     left, right = measured[-1].signature.hidden
     assert left > right + 1.0
@@ -145,23 +140,24 @@ def test_an_unknown_plug_in_is_refused_with_the_known_ones(own_parts, log, appro
         ([*replay, "--export", "sheet=a.csv"], "rosbag-sqlite3, table), got 'sheet'"),
         ([*replay, "--export", "table"], "--export: expected NAME=TARGET, got 'table'"),
         ([*run, "--car", str(tmp_path / "radar.json")], "worldstate.measurements (v2x), got 'radar'"),
-        (
-            [*run, "--car", str(tmp_path / "v2x.json")],
-            "v2x: expected a part that works, got FileNotFoundError",
-        ),
+        ([*run, "--car", str(tmp_path / "v2x.json")], "v2x: expected a part that works, got FileNotFound"),
         ([*run, "--detector", "yolo"], "worldstate.detectors (motion, knn, FILE.onnx, moving-columns), got"),
     ):
         assert main(options) == 2, options
         assert said in " ".join(capsys.readouterr().err.split()), options
 
 
+def installed_module(folder, name, text, entry):
+    """Write a module and an exporter in it as an installed package has them."""
+    (folder / f"{name}.py").write_text(text)
+    (info := folder / f"{name}-1.0.dist-info").mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[worldstate.exporters]\n{entry}\n")
+
+
 def test_a_broken_plug_in_has_its_own_error(log, tmp_path, monkeypatch, capsys):
     for name, text in (("broken", "raise RuntimeError('no licence')"), ("number", "export = 7")):
-        (tmp_path / f"{name}.py").write_text(text)
-        info = tmp_path / f"{name}-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[worldstate.exporters]\n{name} = {name}:export\n")
+        installed_module(tmp_path, name, text, f"{name} = {name}:export")
     monkeypatch.syspath_prepend(tmp_path)
     for name, said in (("broken", "(RuntimeError: no licence)"), ("number", "to be callable, got 7")):
         assert main(["log", "replay", str(log), "--export", f"{name}=x"]) == 2
@@ -186,15 +182,10 @@ def at_a_state(target):
 
 @pytest.mark.parametrize("name", ["at_once", "at_a_state"])
 def test_a_plug_in_that_exits_is_an_error(name, log, tmp_path, monkeypatch, capsys):
-    (tmp_path / "raising.py").write_text(RAISING)
-    info = tmp_path / "raising-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: raising\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[worldstate.exporters]\n{name} = raising:{name}\n")
+    installed_module(tmp_path, "raising", RAISING, f"{name} = raising:{name}")
     monkeypatch.syspath_prepend(tmp_path)
     assert main(["log", "replay", str(log), "--export", f"{name}=x"]) == 2
-    said = capsys.readouterr().err
-    assert f"{name}: expected a part that works, got SystemExit" in said
+    assert f"{name}: expected a part that works, got SystemExit" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("error", [SystemExit(0), BaseException("odd"), RuntimeError("no licence")])
@@ -213,3 +204,109 @@ def test_a_detector_that_raises_ends_the_run_with_its_name(error):
 def test_a_signal_during_a_plug_in_is_not_its_error():
     with pytest.raises(SystemExit), of_part("mine"):
         raise SystemExit(128 + 15)
+
+
+def test_the_example_of_a_loop_hands_over_a_hidden_vehicle(capsys):
+    own_loop = example("own_loop")
+    at = {state.stamp_ns / 1e9: state for state in own_loop.run()}
+    assert at[1.4].entities == ()
+    (hidden,), (seen,) = at[3.5].entities, at[4.5].entities
+    assert (hidden.status, hidden.direction, seen.status) == ("hidden", "left", "visible")
+    assert hidden.id == seen.id
+    assert at[1.4].risk < 0.1 < 0.8 < at[3.5].risk
+    # The remaining risk is the share of vehicles that are followed by another.
+    assert at[4.5].risk == pytest.approx(StreetModel().follows, abs=0.05)
+    assert [cue.advisory is not None for cue in at[3.5].cues] == [True, False]
+    assert seen.azimuth_rad == pytest.approx(own_loop.azimuth_at(4.5), abs=0.03)
+    own_loop.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert "hidden at +" in lines[4]
+    assert "visible at" in lines[-1]
+
+
+# NanoDet: its decoder against a computed box, and the real model on recordings.
+
+RECORDINGS = Path(os.environ.get("OVAD_SEQUENCES", ROOT.parent / "shared" / "ovad-sequences"))
+CAR = 2
+
+
+@pytest.fixture(scope="module")
+def nanodet():
+    return example("nanodet")
+
+
+class OneBox:
+    """A session with one detection in every crop, in a cell of stride 16."""
+
+    def __init__(self, row, column, bins, score=0.9):
+        sizes = [(416 // stride) ** 2 for stride in (8, 16, 32)]
+        self.scores = [np.zeros((1, n, 80), np.float32) for n in sizes]
+        self.logits = [np.zeros((1, n, 32), np.float32) for n in sizes]
+        cell = row * 26 + column
+        self.scores[1][0, cell, CAR] = score
+        self.logits[1][0, cell] = np.array(bins, np.float32).reshape(32)
+
+    def get_inputs(self):
+        return [SimpleNamespace(name="image")]
+
+    def run(self, names, feed):
+        (self.seen,) = feed.values()
+        return [*self.scores, *self.logits]
+
+
+def certain(*bins):
+    """Return logits with each side at a given bin; a half is shared by two bins."""
+    rows = np.full((4, 8), -100.0)
+    for row, value in zip(rows, bins, strict=True):
+        row[[int(np.floor(value)), int(np.ceil(value))]] = 0.0
+    return rows
+
+
+def test_a_box_is_decoded_as_computed(nanodet):
+    # The cell's middle is 16 (5, 3) + 7.5 = (87.5, 55.5); its sides are 32, 8, 16 and 48 px away. The crop
+    # begins at (100, 50) and is twice the size of the input.
+    session = OneBox(3, 5, certain(2, 0.5, 1, 3))
+    detector: Detector = nanodet.NanoDet(session, [(100.0, 50.0, 832.0)])
+    found = detector.detect(np.full((1216, 1936, 3), 128, np.uint8))
+    assert found.labels == ("car",)
+    np.testing.assert_allclose(found.boxes_px, [[211.0, 145.0, 307.0, 257.0]], atol=1e-3)
+    np.testing.assert_allclose(found.scores, [0.9], rtol=1e-6)
+    assert session.seen.shape == (1, 3, 416, 416)
+    np.testing.assert_allclose(session.seen[0, 0], (128 - 103.53) / 57.375, rtol=1e-5)
+
+
+def test_a_cut_box_has_a_lower_score_and_is_suppressed(nanodet):
+    # In the input from 1.5 to 103.5 px: cut by the left edge of every crop but the first.
+    session = OneBox(3, 5, certain(5.375, 0.5, 1, 3))
+    session.logits[1][0, 3 * 26 + 5, :8] = -100.0
+    session.logits[1][0, 3 * 26 + 5, 5:7] = np.log([0.625, 0.375])
+    image = np.zeros((1216, 1936, 3), np.uint8)
+    alone, both = (nanodet.NanoDet(session, crops) for crops in (((100, 0, 832),), ((0, 0, 832),)))
+    assert alone.detect(image).scores[0] == pytest.approx(0.72)
+    assert both.detect(image).scores[0] == pytest.approx(0.9)
+    better, part = [0.0, 0.0, 100.0, 50.0], [60.0, 0.0, 100.0, 50.0]
+    within = nanodet._within_better(np.array([better, part, [90.0, 0.0, 190.0, 50.0]]))
+    assert within.tolist() == [False, True, False]
+
+
+def test_a_model_that_is_not_there_is_named(nanodet, tmp_path):
+    with pytest.raises(InputFileError, match="expected an ONNX model"):
+        nanodet.open_nanodet(tmp_path / "none.onnx")
+
+
+@pytest.mark.skipif(
+    not (RECORDINGS / "detector").is_dir(),
+    reason="no ovad-sequences, neither where OVAD_SEQUENCES points nor in ../shared",
+)
+def test_boxes_are_those_that_come_with_the_recordings(nanodet, monkeypatch):
+    # As `worldstate run --detector nanodet` opens it.
+    monkeypatch.setenv("NANODET_ONNX", str(RECORDINGS / "detector" / "nanodet_m.onnx"))
+    detector = OwnDetector.of("nanodet", nanodet.open_nanodet)
+    given = json.loads((RECORDINGS / "boxes" / "1_04_0018.json").read_text())["frames"]
+    shared = []
+    for number, image in enumerate(open_video(RECORDINGS / "video" / "1_04_0018.mp4").frames()):
+        if number in (40, 75, 85):
+            boxes = np.array([row[:4] for row in given[number]])
+            shared += overlaps(boxes, detector.detect(image).boxes_px).max(axis=1).tolist()
+    assert len(shared) > 10
+    assert np.mean(np.array(shared) > 0.9) > 0.9
