@@ -33,12 +33,11 @@ def side_of(one: Occluder) -> SideGeometry:
     return SideGeometry(one.direction, *measures)
 
 
-@given(
-    st.floats(2.0, 9.0), st.floats(1.5, 8.0), st.floats(1.0, 15.0), st.floats(1.0, 15.0), st.integers(0, 8)
-)
-def test_the_hidden_azimuth_follows_the_plan(
-    x_m: float, y_m: float, beyond_m: float, speed_mps: float, group: int
-) -> None:
+LENGTHS = st.floats(2.0, 9.0), st.floats(1.5, 8.0), st.floats(1.0, 15.0), st.floats(1.0, 15.0)
+
+
+@given(*LENGTHS, st.integers(0, 8))
+def test_the_hidden_azimuth_follows_the_plan(x_m, y_m, beyond_m, speed_mps, group) -> None:
     """Oracle: the position on the lane at a given time before the line of sight is crossed."""
     crossing_m = x_m + beyond_m
     coming = np.zeros(len(COMING_S))
@@ -56,9 +55,8 @@ def test_the_hidden_azimuth_follows_the_plan(
 
 
 def test_a_context_file_replaces_defaults(tmp_path: Path) -> None:
-    context = read_context(
-        written(tmp_path, arms=[RIGHT, LEFT], site="Elm Street", rates={**rates(), "arrival_hz": 0.01})
-    )
+    more_often = {**rates(), "arrival_hz": 0.01}
+    context = read_context(written(tmp_path, arms=[RIGHT, LEFT], site="Elm Street", rates=more_often))
     assert context.directions == ("left", "right") and context.site == "Elm Street"
     assert context.rates.arrival_hz == 0.01 and context.view_half_angle_rad == Context().view_half_angle_rad
     assert [one.assumed for one in context.occluders] == [False, False]
@@ -86,24 +84,15 @@ def rates() -> dict[str, float]:
         ({"arm": [LEFT, RIGHT]}, "expected keys among"),
         ({"arms": [LEFT, {**RIGHT, "speed": 12.0}]}, r"context.arms\[1\]: expected keys among .*\['speed'\]"),
         ({"rates": {**rates(), "arrivals_hz": 0.01}}, r"context.rates: expected keys among .*'arrivals_hz'"),
-        (
-            {"arms": [{**LEFT, "direction": one} for one in "abcd"]},
-            "expected at most 3 approach sides, got 4",
-        ),
+        ({"arms": [{**LEFT, "direction": one} for one in "abcd"]}, "at most 3 approach sides, got 4"),
         ({"arms": [LEFT, LEFT]}, r"context\.arms: expected different directions, got \['left', 'left'\]"),
         ({"arms": []}, r"context\.arms: expected different"),
-        (
-            {"view_half_angle_deg": 200.0},
-            r"context\.view_half_angle_deg: expected a number in \[0.0, 180.0\]",
-        ),
+        ({"view_half_angle_deg": 200.0}, r"context\.view_half_angle_deg: .* number in \[0.0, 180.0\]"),
         ({"arms": [RIGHT, {**LEFT, "corner_m": [5.0, 0.0]}]}, r"context\.arms\[1\]: corner_m"),
         ({"arms": [{**LEFT, "corner_m": [9.5, 3.0]}, RIGHT]}, "nearer than 9"),
         ({"arms": [{**LEFT, "speed_mps": -1.0}, RIGHT]}, "speed_mps"),
         ({"arms": [{**LEFT, "crossing_m": None}, RIGHT]}, "crossing_m"),
-        (
-            {"arms": [{"direction": "left"}, RIGHT]},
-            r"context\.arms\[0\]: expected corner_m and crossing_m, or",
-        ),
+        ({"arms": [{"direction": "left"}, RIGHT]}, r"arms\[0\]: expected corner_m and crossing_m, or"),
         ({"ego_speed_mps": "fast"}, "ego_speed_mps"),
     ],
 )
@@ -115,13 +104,9 @@ def test_a_wrong_context_is_refused_with_its_key(tmp_path: Path, keys: dict[str,
 @pytest.mark.long
 def test_run_accepts_a_context_file(approach, tmp_path: Path) -> None:
     out, file = tmp_path / "s.jsonl", written(tmp_path, arms=[LEFT, RIGHT], site="Elm Street")
-    given_array = ["--array", str(approach.array_path)]
-    assert (
-        main(["run", str(approach.audio_path), *given_array, "--context", str(file), "--out", str(out)]) == 0
-    )
+    run = ["run", str(approach.audio_path), "--array", str(approach.array_path), "--context"]
+    assert main([*run, str(file), "--out", str(out)]) == 0
     last = json.loads(out.read_text().splitlines()[-1])["context"]
     assert last["site"] == "Elm Street"
     assert last["occluders"][0]["edge_azimuth_rad"] == pytest.approx(math.atan2(3.0, 5.0))
-    assert (
-        main(["run", str(approach.audio_path), *given_array, "--context", str(tmp_path / "none.json")]) == 2
-    )
+    assert main([*run, str(tmp_path / "none.json")]) == 2

@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from camera_boxes import boxed
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up_sound import THREE
 
-from worldstate import DetectionFrame, Listener, MicrophoneArray, Odometry, PinholeCamera
+from worldstate import Listener, MicrophoneArray, Odometry, PinholeCamera
 from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
-from worldstate.adapters.files.model_file import Model, read_model
+from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.adapters.source import ListenSettings
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import ovad_array
@@ -20,57 +23,49 @@ from worldstate.ground import InvalidArgumentError, nanoseconds
 from worldstate.ground.typing import Float32Array
 
 RATE_HZ = 16_000
-ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
 RNG = np.random.default_rng(5)
 SOUND = (0.1 * RNG.standard_normal((3 * RATE_HZ, 3)).cumsum(axis=1)).astype(np.float32)
-CAR = DetectionFrame(np.array([[300.0, 200.0, 380.0, 260.0]]), np.array([0.9]), ("car",))
-TRUCK = DetectionFrame(np.array([[300.0, 200.0, 380.0, 260.0]]), np.array([0.9]), ("truck",))
+CAR, TRUCK = (boxed((300, 200, 380, 260), label=label) for label in ("car", "truck"))
 
 
 @pytest.fixture(scope="module")
 def model() -> Model:
     """Return the shipped model with a domain of three microphones."""
     shipped = read_model()
-    return replace(shipped, signature=replace(shipped.signature, domain=domain_of(ARRAY, [6000], ["SA1"])))
-
-
-def looked(listener: Listener, start: int, end: int) -> None:
-    """Push the images of these samples; the one at 0.5 s shows a truck."""
-    for number in range(30):
-        if start <= number * RATE_HZ // 10 < end:
-            listener.look(nanoseconds(number / 10), TRUCK if number == 5 else CAR)
+    return replace(shipped, signature=replace(shipped.signature, domain=domain_of(THREE, [6000], ["SA1"])))
 
 
 def pushed(listener: Listener, start: int, end: int) -> list[str]:
-    looked(listener, start, end)
-    return [state.to_json() for state in listener.push(SOUND[start:end])]
+    """Push samples and their images, of which the one at 0.5 s shows a truck; the last ones end the sound."""
+    for number in range(30):
+        if start <= number * RATE_HZ // 10 < end:
+            listener.look(nanoseconds(number / 10), TRUCK if number == 5 else CAR)
+    blocks = [SOUND[start:end], None] if end == len(SOUND) else [SOUND[start:end]]
+    return [state.to_json() for block in blocks for state in listener.push(block)]
 
 
 @pytest.fixture(scope="module")
 def in_one(model: Model) -> list[str]:
-    listener = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad())
-    return pushed(listener, 0, len(SOUND)) + [state.to_json() for state in listener.push(None)]
+    listener = Listener(THREE, RATE_HZ, model=model, camera=PinholeCamera.ovad())
+    return pushed(listener, 0, len(SOUND))
 
 
 @pytest.mark.long
 @settings(max_examples=8)
-@given(cut=st.integers(0, len(SOUND)))
-def test_another_listener_continues_at_any_sample_bit_for_bit(
-    cut: int, model: Model, in_one: list[str]
-) -> None:
-    first = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad())
+@given(cut=st.integers(0, len(SOUND) - 1))
+def test_another_listener_continues_at_any_sample_bit_for_bit(cut, model, in_one) -> None:
+    first = Listener(THREE, RATE_HZ, model=model, camera=PinholeCamera.ovad())
     states = pushed(first, 0, cut)
     kept = first.checkpoint()
     first.push(SOUND[cut:])  # a checkpoint stays what it was
     for _ in range(2):  # and is gone on from more than once
-        second = Listener(ARRAY, RATE_HZ, model=model, camera=PinholeCamera.ovad(), resume=kept)
-        rest = pushed(second, cut, len(SOUND)) + [state.to_json() for state in second.push(None)]
-        assert states + rest == in_one
+        second = Listener(THREE, RATE_HZ, model=model, camera=PinholeCamera.ovad(), resume=kept)
+        assert states + pushed(second, cut, len(SOUND)) == in_one
 
 
 def test_a_skipped_loss_keeps_the_time_and_is_reported(model: Model) -> None:
     silence = np.zeros((round(0.9 * RATE_HZ), 3), np.float32)
-    listener = Listener(ARRAY, RATE_HZ, model=model)
+    listener = Listener(THREE, RATE_HZ, model=model)
     listener.push(np.concatenate([SOUND, silence]))
     listener.skip(4 * 10**9)
     told = {one.stamp_ns: one.heard[0] for one in listener.push(SOUND)}
@@ -84,14 +79,9 @@ def test_a_skipped_loss_keeps_the_time_and_is_reported(model: Model) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("size", [1, 37, 480, 48_000])
-def test_pushed_states_equal_run_for_any_block_size(
-    size: int, tmp_path: Path, model: Model, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from worldstate.adapters.files.array_file import write_array_xml
-    from worldstate.adapters.files.model_file import save_model
-
+def test_pushed_states_equal_run_for_any_block_size(size, tmp_path, model, capsys) -> None:
     save_model(tmp_path / "model.json", model)
-    write_array_xml(tmp_path / "three.xml", ARRAY)
+    write_array_xml(tmp_path / "three.xml", THREE)
     soundfile.write(tmp_path / "sound.wav", SOUND, RATE_HZ, subtype="FLOAT")
     options = ["--array", str(tmp_path / "three.xml"), "--model", str(tmp_path / "model.json")]
     out = tmp_path / "states.jsonl"
@@ -113,11 +103,11 @@ def test_the_pushed_demo_recording_equals_run(approach, tmp_path: Path) -> None:
 
 def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path, model: Model) -> None:
     told = [Odometry("wheels", nanoseconds(at), 0.0) for at in (0.4, 1.4, 2.4)]
-    whole = Listener(ARRAY, RATE_HZ, model=model)
+    whole = Listener(THREE, RATE_HZ, model=model)
     whole.add(*told)
     first, rest = whole.push(SOUND[: 2 * RATE_HZ]), None
     save_checkpoint(tmp_path / "now.json", whole.checkpoint())
-    second = Listener(ARRAY, RATE_HZ, model=model, resume=tmp_path / "now.json", start_s=0.0)
+    second = Listener(THREE, RATE_HZ, model=model, resume=tmp_path / "now.json", start_s=0.0)
     second.add(*told)
     rest = second.push(SOUND)
     assert rest == whole.push(SOUND[2 * RATE_HZ :])
@@ -126,18 +116,18 @@ def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path, mod
 
 
 def test_a_checkpoint_of_another_array_or_rate_is_refused(model: Model) -> None:
-    kept: Checkpoint = Listener(ARRAY, RATE_HZ, model=model).checkpoint()
+    kept: Checkpoint = Listener(THREE, RATE_HZ, model=model).checkpoint()
     moved = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.2, 0.0]])
     anything = ListenSettings(uncalibrated=True)
-    for array, rate, free in ((moved, RATE_HZ, anything), (ARRAY, 48_000, ListenSettings())):
+    for array, rate, free in ((moved, RATE_HZ, anything), (THREE, 48_000, ListenSettings())):
         with pytest.raises(InvalidArgumentError, match="resume: expected the array, rate"):
             Listener(array, rate, model=model, resume=kept, settings=free)
     with pytest.raises(InvalidArgumentError, match="model: expected nothing beside a source"):
-        Listener(Listener(ARRAY, RATE_HZ, model=model)._source, RATE_HZ, model=model)
+        Listener(Listener(THREE, RATE_HZ, model=model)._source, RATE_HZ, model=model)
 
 
 def test_samples_of_another_shape_are_refused_and_nothing_is_lost(model: Model) -> None:
-    listener, other = (Listener(ARRAY, RATE_HZ, model=model) for _ in range(2))
+    listener, other = (Listener(THREE, RATE_HZ, model=model) for _ in range(2))
     wrong: Float32Array
     for wrong in (SOUND[:100, :2], np.full((5, 3), np.nan, np.float32)):
         with pytest.raises(InvalidArgumentError, match="block"):

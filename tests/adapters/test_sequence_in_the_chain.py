@@ -11,8 +11,9 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sequence import sequence_model
+from made_up_sound import THREE
 
-from worldstate import Context, MicrophoneArray, WorldState
+from worldstate import Context, WorldState
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
 from worldstate.abduction.road_users import neutral
 from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
@@ -37,7 +38,6 @@ from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.state import Hearing
 
 RATE_HZ = 6000
-ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
 
 
 @pytest.fixture(scope="module")
@@ -48,22 +48,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sound = rng.standard_normal((3 * RATE_HZ, 3)).cumsum(axis=1)
     soundfile.write(place / "sound.wav", swelling * sound, RATE_HZ)
     expert = Expert("mean", np.zeros(60), np.ones(60), 0.2 * rng.normal(size=(6, 60)), np.zeros(6))
-    windows = EnsembleModel(
-        *((expert,), np.full(6, 1 / 6), np.zeros(180), np.zeros(60)),
-        domain=domain_of(ARRAY, [RATE_HZ], ["S1"]),
-        classes=WINDOW_CLASSES,
-    )
-    shipped = read_model()
-    model = Model(
-        *(windows, shipped.policies, shipped.provenance),
-        sequence=sequence_model(rng, SequenceAlarm(0.0, 15.0)),
-    )
+    weights, domain = ((expert,), np.full(6, 1 / 6), np.zeros(180)), domain_of(THREE, [RATE_HZ], ["S1"])
+    windows = EnsembleModel(*weights, np.zeros(60), domain=domain, classes=WINDOW_CLASSES)
+    shipped, sequence = read_model(), sequence_model(rng, SequenceAlarm(0.0, 15.0))
+    model = Model(windows, shipped.policies, shipped.provenance, sequence=sequence)
     save_model(place / "model.json", model)
     return place
 
 
-def steps(folder: Path, **options: object) -> Iterator[Step]:
-    source = open_source(folder / "sound.wav", model=folder / "model.json", **options)  # type: ignore[arg-type]
+def steps(folder: Path, model: Model | None = None, **options: object) -> Iterator[Step]:
+    source = open_source(folder / "sound.wav", model=model or folder / "model.json", **options)  # type: ignore[arg-type]
     return listen_steps(source)
 
 
@@ -75,9 +69,7 @@ def whole(folder: Path) -> list[Step]:
 @pytest.mark.long
 @settings(max_examples=20)
 @given(cuts=st.lists(st.integers(0, 3 * RATE_HZ), max_size=20))
-def test_states_are_the_same_to_the_bit_for_blocks_of_any_length(
-    folder: Path, whole: list[Step], cuts: list[int]
-) -> None:
+def test_states_are_the_same_to_the_bit_for_blocks_of_any_length(folder, whole, cuts) -> None:
     sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
     source = open_source(folder / "sound.wav", model=folder / "model.json")
     listener = Listener(source, RATE_HZ)
@@ -104,14 +96,17 @@ def test_measurements_take_effect_at_their_stamp_across_a_checkpoint(folder: Pat
 
 def test_a_running_chain_equals_a_stream_on_disk(folder: Path, whole: list[Step]) -> None:
     heard, model = whole, read_model(folder / "model.json")
-    frames = [step.frame for step in heard]
-    looming = [one.looming if isinstance(one.looming, Looming) else None for one in frames]
-    columns = {
-        name: np.array([getattr(one, name) for one in frames])
-        for name in ("feature", "band_log_energy", "prominence", "bearing_rad")
-    }
-    columns["looming_hz"] = np.array([np.nan if one is None else one.inverse_tta_hz for one in looming])
-    columns["looming_std_hz"] = np.array([np.nan if one is None else one.std_hz for one in looming])
+    frames, names = (
+        [step.frame for step in heard],
+        ("feature", "band_log_energy", "prominence", "bearing_rad"),
+    )
+    rows: dict[str, list] = {name: [getattr(one, name) for one in frames] for name in names}
+    rows |= {"looming_hz": [], "looming_std_hz": []}
+    for one in (frame.looming for frame in frames):
+        known = isinstance(one, Looming)
+        rows["looming_hz"].append(one.inverse_tta_hz if known else np.nan)
+        rows["looming_std_hz"].append(one.std_hz if known else np.nan)
+    columns = {name: np.array(values) for name, values in rows.items()}
     stream = HeardStream(HopTable(columns), HopTable({}), HopTable({}))
     assert isinstance(model.signature, EnsembleModel) and model.sequence is not None
     said = model.sequence.posterior(stream_evidence(model.signature, stream)).groups
@@ -130,7 +125,7 @@ def test_the_snapshot_has_the_shares_of_the_exam_within_its_domain(folder: Path)
     known = replace(model, provenance=card)
 
     def heard(**more: object) -> Hearing:
-        (one,) = next(listen_steps(open_source(folder / "sound.wav", model=known, **more))).state.heard
+        (one,) = next(steps(folder, known, **more)).state.heard
         return one
 
     here = heard()
@@ -145,17 +140,15 @@ def test_outside_of_its_domain_a_sequence_has_a_reason(folder: Path) -> None:
     model = read_model(folder / "model.json")
     domain = replace(model.signature.domain, ego_motion="moving")
     driven = replace(model, signature=replace(model.signature, domain=domain))
-    stands, moves = (
-        next(listen_steps(open_source(folder / "sound.wav", model=driven, context=context))).state
-        for context in (Context(), Context(ego_speed_mps=5.0))
-    )
+    contexts = Context(), Context(ego_speed_mps=5.0)
+    stands, moves = (next(steps(folder, driven, context=one)).state for one in contexts)
     assert stands.no_sequence == NotUsable("the model was made for a moving ego, this one is standing")
     assert moves.no_sequence is not None and "made for" not in moves.no_sequence.reason  # too short as yet
-    other = replace(ARRAY, positions_m=1.1 * ARRAY.positions_m)
+    other = replace(THREE, positions_m=1.1 * THREE.positions_m)
     free = next(steps(folder, array=other, settings=ListenSettings(uncalibrated=True))).state
     assert free.no_sequence is not None and free.no_sequence.reason.startswith("uncalibrated")
     unfit = replace(model, provenance=replace(model.provenance, fit_for_use=False))
-    quick = next(listen_steps(open_source(folder / "sound.wav", model=unfit))).state
+    quick = next(steps(folder, unfit)).state
     assert quick.no_sequence == NotUsable("the model is marked as unfit for use")
     assert {cue.within for cue in (*moving.cues, *free.cues, *quick.cues)} == {None}
 
@@ -176,7 +169,7 @@ def lossy(folder: Path, tmp_path: Path, seconds: float) -> tuple[list[Step], lis
         hurt = sound.copy()
         hurt[3 * RATE_HZ : 3 * RATE_HZ + lost] = 0.0
         soundfile.write(tmp_path / name, hurt, RATE_HZ)
-        source = open_source(tmp_path / name, model=folder / "model.json", array=ARRAY)
+        source = open_source(tmp_path / name, model=folder / "model.json", array=THREE)
         heard.append(list(listen_steps(source)))
     return heard[0], heard[1]
 
@@ -222,13 +215,13 @@ def test_a_checkpoint_within_a_loss_continues(folder: Path, tmp_path: Path) -> N
     save_checkpoint(tmp_path / "half.json", cut.checkpoint)
     assert cut.checkpoint.history is not None and cut.checkpoint.history.missed > 0
     before = read_checkpoint(tmp_path / "half.json")
-    source = open_source(tmp_path / "lossy.wav", model=folder / "model.json", array=ARRAY, resume=before)
+    source = open_source(tmp_path / "lossy.wav", model=folder / "model.json", array=THREE, resume=before)
     assert [one.state.to_json() for one in listen_steps(source)] == [one.state.to_json() for one in hurt[26:]]
 
 
 def test_a_model_without_a_sequence_has_a_reason(folder: Path) -> None:
     plain = replace(read_model(folder / "model.json"), sequence=None)
-    state = next(listen_steps(open_source(folder / "sound.wav", model=plain))).state
+    state = next(steps(folder, plain)).state
     assert state.no_sequence is not None and "model make" in state.no_sequence.reason
     assert {cue.within for cue in state.cues} == {None}
 
@@ -237,10 +230,7 @@ def curved(folder: Path) -> Model:
     """Return the model with an alarm curve whose thresholds span the log-odds of its sound."""
     model = read_model(folder / "model.json")
     silent = replace(model.sequence, alarm=SequenceAlarm(1e6, 15.0))
-    heard = [
-        step.state
-        for step in listen_steps(open_source(folder / "sound.wav", model=replace(model, sequence=silent)))
-    ]
+    heard = [step.state for step in steps(folder, replace(model, sequence=silent))]
     nats = np.array([[cue.evidence.compared_nats for cue in state.cues] for state in heard[9:]]).max(axis=1)
     rates = np.array([[0.0, 6.0, 30.0], [0.0, 3.0, 20.0], [3.0, 12.0, 45.0]])
     points = [np.array([nats.max() + 1.0, nats.max(), nats.min()]), *rates, *(rates / 600.0)]
@@ -250,8 +240,7 @@ def curved(folder: Path) -> Model:
 
 def advised(folder: Path, model: Model, **asked: float) -> tuple[int, WorldState]:
     """Return the number of advisories of all hops and sides, and the last snapshot."""
-    source = open_source(folder / "sound.wav", model=model, **asked)  # type: ignore[arg-type]
-    states = [step.state for step in listen_steps(source)]
+    states = [step.state for step in steps(folder, model, **asked)]
     return sum(cue.advisory is not None for state in states for cue in state.cues), states[-1]
 
 
@@ -270,7 +259,7 @@ def test_a_requested_budget_sets_threshold_and_promise(folder: Path) -> None:
         assert WorldState.from_json(state.to_json()) == state
     told = advised(folder, model, alpha=0.02)[1].budget
     assert told is not None and (told.asked_alpha, told.onsets_per_hour) == (0.02, 6.0)
-    listener = Listener(ARRAY, RATE_HZ, model=model, budget=30.0)
+    listener = Listener(THREE, RATE_HZ, model=model, budget=30.0)
     sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
     assert sum(cue.advisory is not None for state in listener.push(sound) for cue in state.cues) == many
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from camera_boxes import boxed, write_boxes
+from made_up_sound import plane_wave
 from scipy.spatial.transform import Rotation
 
-from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
 from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.adapters.vehicle.car_file import Mounting, read_car
 from worldstate.cli.main import main
 from worldstate.frontend.settings import FrontEndSettings
@@ -35,6 +35,12 @@ def written(folder: Path, car: object) -> Path:
     return path
 
 
+def street(folder: Path) -> str:
+    """Write 1.5 s of noise of ten microphones."""
+    soundfile.write(folder / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
+    return str(folder / "street.wav")
+
+
 @pytest.mark.parametrize("angles", [(30.0, -12.0, 5.0), (-170.0, 80.0, -179.0), (0.0, 0.0, 90.0)])
 def test_rotations_of_a_mounting_equal_scipy(angles):
     yaw, pitch, roll = angles
@@ -51,14 +57,12 @@ def test_pitch_turns_camera_and_array_alike(tmp_path):
 
 
 def test_bearings_of_a_tilted_array_are_in_vehicle_axes(tmp_path):
-    array = read_car(written(tmp_path, CAR)).array
-    rate, azimuth = 16_000, math.radians(50.0)
-    spectrum = np.fft.rfft(np.random.default_rng(2).standard_normal(2 * rate))
-    frequencies = np.fft.rfftfreq(2 * rate, 1.0 / rate)
-    phase = np.exp(-2j * np.pi * frequencies[:, None] * array.delays_s(azimuth))
-    sound = np.fft.irfft(spectrum[:, None] * phase, axis=0)
-    settings = FrontEndSettings(azimuth_span_deg=(-180.0, 180.0))
-    heard = FrontEnd(array, rate, settings).process(sound)[-1]
+    array, settings = (
+        read_car(written(tmp_path, CAR)).array,
+        FrontEndSettings(azimuth_span_deg=(-180.0, 180.0)),
+    )
+    sound = plane_wave(array, 16_000, math.radians(50.0), 2.0)
+    heard = FrontEnd(array, 16_000, settings).process(sound)[-1]
     assert math.degrees(heard.bearing_rad) == pytest.approx(50.0, abs=1.0)
 
 
@@ -114,29 +118,8 @@ def test_errors_of_a_car_file_name_the_field(tmp_path, car, said):
     assert "car.json" in str(refused.value)
 
 
-def test_the_stamp_offset_shifts_the_looks(tmp_path):
-    soundfile.write(
-        tmp_path / "street.wav", np.random.default_rng(0).uniform(-0.01, 0.01, (24_000, 10)), 16_000
-    )
-    car = read_car(written(tmp_path, CAR))
-    seen = DetectionFrame(np.array([[260.0, 100.0, 380.0, 300.0]]), np.array([0.9]), ("car",))
-    log = DetectionLog((seen,), np.array([1_000_000_000]))
-    source = open_source(
-        tmp_path / "street.wav",
-        array=car.array,
-        camera=car.camera("front"),
-        detections=log,
-        settings=ListenSettings(uncalibrated=True),
-    )
-    channel = source.camera_channel()
-    assert channel.last_look(1_200_000_000) is None
-    assert channel.last_look(1_300_000_000).stamp_ns == 1_250_000_000
-
-
 def test_run_and_live_accept_a_car_file(tmp_path, capsys):
-    noise = np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10))
-    soundfile.write(tmp_path / "street.wav", noise, 16_000)
-    car, sound = str(written(tmp_path, CAR)), str(tmp_path / "street.wav")
+    car, sound = str(written(tmp_path, CAR)), street(tmp_path)
     assert main(["run", sound, "--car", car, "--uncalibrated", "--json"]) == 0
     heard = json.loads(capsys.readouterr().out)
     assert heard["array"].startswith("10 microphones")
@@ -146,15 +129,14 @@ def test_run_and_live_accept_a_car_file(tmp_path, capsys):
 
 def test_a_car_file_equals_single_options(tmp_path):
     """Array, boxes of two cameras, motion, engine and model give the states of single options."""
-    soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
     (tmp_path / "moves.csv").write_text("time_s,speed_mps\n0,3\n9,3\n")
     save_model(tmp_path / "mine.json", read_model())
-    wide = [FRONT | {"horizontal_fov_deg": 90.0}, LEFT | {"horizontal_fov_deg": 90.0}]
+    wide = [one | {"horizontal_fov_deg": 90.0} for one in (FRONT, LEFT)]
     sensors = read_car(written(tmp_path, CAR | {"cameras": wide})).cameras
     told = [boxes(tmp_path, name, sensors[name].column(np.full(15, 0.5)).tolist()) for name in sensors]
     options = [word for one in told for word in ("--detections", one)]
     options += ["--odometry", str(tmp_path / "moves.csv"), "--model", str(tmp_path / "mine.json")]
-    words = ["run", str(tmp_path / "street.wav"), "--car", str(tmp_path / "car.json")]
+    words = ["run", street(tmp_path), "--car", str(tmp_path / "car.json")]
     assert main([*words, *options, "--uncalibrated", "--out", str(tmp_path / "by_options.jsonl")]) == 0
     full = [one | {"detections": f"{one['name']}.json"} for one in wide]
     written(tmp_path, CAR | {"cameras": full, "odometry": "moves.csv", "model": "mine.json"})
@@ -165,64 +147,40 @@ def test_a_car_file_equals_single_options(tmp_path):
     assert [one["sensor"] for one in last["searched"]] == ["front", "left"]
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--array", "mics.csv"], "car: expected no array with it"),
-        (["--camera", "lens.json"], "camera: expected one of front, left, got 'lens.json'"),
-        (
-            ["--detections", "a.json", "--detections", "b.json", "--uncalibrated"],
-            "--detections: expected one, or --car with",
-        ),
-    ],
-)
-def test_options_that_contradict_the_car_file_raise_an_error(tmp_path, capsys, words, said):
-    assert main(["run", "street.wav", "--car", str(written(tmp_path, CAR)), *words]) == 2
-    assert said in capsys.readouterr().err
-
-
 def boxes(folder: Path, name: str, columns_px: list[float]) -> str:
-    frames = [{"boxes": [[x - 15.0, 100.0, x + 15.0, 300.0]], "scores": [0.9], "classes_str": ["car"]}
-              for x in columns_px]  # fmt: skip
-    path = folder / f"{name}.json"
-    path.write_text(json.dumps({"detections_per_frame": frames}))
+    path = write_boxes(folder / f"{name}.json", [boxed((x - 15, 100, x + 15, 300)) for x in columns_px])
     return f"{name}={path}"
 
 
 def test_boxes_of_two_cameras_become_one_vehicle(tmp_path):
     """The vehicle is left in the image of the front camera and right in that of the left one."""
-    soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
-    wide = [FRONT | {"horizontal_fov_deg": 90.0}, LEFT | {"horizontal_fov_deg": 90.0}]
+    wide = [one | {"horizontal_fov_deg": 90.0} for one in (FRONT, LEFT)]
     car, out = written(tmp_path, CAR | {"cameras": wide}), tmp_path / "states.jsonl"
     sensors, azimuths = read_car(car).cameras, np.radians(26.0 + 0.5 * np.arange(15))
     told = [boxes(tmp_path, name, sensors[name].column(azimuths).tolist()) for name in ("front", "left")]
     words = ["--car", str(car), *(word for one in told for word in ("--detections", one))]
     words += ["--uncalibrated", "--out", str(out)]
-    assert main(["run", str(tmp_path / "street.wav"), *words]) == 0
+    assert main(["run", street(tmp_path), *words]) == 0
     last = json.loads(out.read_text().splitlines()[-1])
     assert [(one["sensor"], one["found"]) for one in last["searched"]] == [("front", True), ("left", True)]
     seen = [one for one in last["entities"] if one["status"] == "visible"]
     assert len(seen) == 1 and seen[0]["azimuth_rad"] == pytest.approx(azimuths[-1], abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (
-            ["--car", "CAR", "--camera", "left", "--detections", "front=a.json"],
-            "detections: expected those of several cameras without a camera",
-        ),
-        (
-            ["--car", "CAR", "--detections", "left=a", "--detections", "left=b"],
-            "--detections: expected different names, got left=a left=b",
-        ),
-        (["--car", "CAR", "--detections", "rear=a.json"], "camera: expected one of front, left, got 'rear'"),
-        (["--car", "CAR", "--detections", "left=a.json"], "a.json"),
-    ],
-)
-def test_wrong_boxes_of_several_cameras_raise_an_error(tmp_path, capsys, words, said):
-    soundfile.write(tmp_path / "street.wav", np.random.default_rng(0).normal(0.0, 0.1, (24_000, 10)), 16_000)
-    car = str(written(tmp_path, CAR))
-    given = [car if word == "CAR" else word for word in words]
-    assert main(["run", str(tmp_path / "street.wav"), "--uncalibrated", *given]) == 2
+TWICE = ["--detections", "left=a", "--detections", "left=b"]
+WRONG = [
+    (["--array", "mics.csv"], "car: expected no array with it"),
+    (["--camera", "lens.json"], "camera: expected one of front, left, got 'lens.json'"),
+    (["--detections", "a.json", "--detections", "b.json"], "--detections: expected one, or --car with"),
+    (["--camera", "left", "--detections", "front=a.json"], "those of several cameras without a camera"),
+    (TWICE, "--detections: expected different names, got left=a left=b"),
+    (["--detections", "rear=a.json"], "camera: expected one of front, left, got 'rear'"),
+    (["--detections", "left=a.json"], "a.json"),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), WRONG)
+def test_options_that_contradict_the_car_file_or_each_other_are_refused(tmp_path, capsys, words, said):
+    run = ["run", street(tmp_path), "--car", str(written(tmp_path, CAR)), "--uncalibrated"]
+    assert main([*run, *words]) == 2
     assert said in capsys.readouterr().err
