@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
+from bag_messages import RATE_HZ, bag_of, blocks, sound_of
 from scripted_states import scripted_states
 
 from worldstate import WorldFilter, WorldState
@@ -18,15 +19,13 @@ from worldstate.adapters.export.log_messages import mcap_file, state_messages
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.checkpoint_file import Checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import read_model, save_model
-from worldstate.adapters.ros.bag_writer import bag_writer, state_bag
-from worldstate.adapters.ros.message_types import AUDIO, header
+from worldstate.adapters.ros.bag_writer import state_bag
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.labelling.street_passes import write_street
 from worldstate.operations.recordings.hop_table import HopTable, save_tables
 from worldstate.simulation.dataset.dataset import LogRow, write_log
 from worldstate.smoothing.learned_street import LearnedStreet
 
-RATE_HZ = 8000
 # Replacements of a number, a text or a bracket: too large, of another type, too deep, too long.
 WRONG = (
     *("-1", "0", "1e308", "-1e308", "1e-320", "1e999", "NaN", "9223372036854775808", "1" + "0" * 400),
@@ -167,12 +166,4 @@ def _write_logs(folder: Path) -> None:
         with state_bag(folder / f"log_{suffix}", 7.0, storage) as export:
             for state in later:
                 export(state)
-        with bag_writer(folder / f"bag_{suffix}", storage) as put:
-            for k in range(12):
-                put("/mics", AUDIO, k, _sound_message(k))
-
-
-def _sound_message(k: int) -> dict[str, object]:
-    samples = np.random.default_rng(k).uniform(-0.5, 0.5, 4 * RATE_HZ // 10).astype(np.float32)
-    layout = {"sample_rate": RATE_HZ, "channels": 4, "layout": "interleaved"}
-    return {"header": header(10**9 + k * 10**8), "data": samples} | layout
+        bag_of(folder / f"bag_{suffix}", blocks(sound_of(12 * RATE_HZ // 10)), storage)

@@ -1,8 +1,11 @@
 """Stand-ins for sound card, camera and detector that play a recording."""
 
+import math
+import socket
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from types import ModuleType, SimpleNamespace
 
@@ -113,3 +116,63 @@ def stand_in(monkeypatch, recording, speed=2.0):
     monkeypatch.setitem(sys.modules, "sounddevice", SoundCard(street))
     monkeypatch.setitem(sys.modules, "ultralytics", yolo)
     monkeypatch.setattr("cv2.VideoCapture", lambda device: Camera(street))
+
+
+def free_port(kind=socket.SOCK_DGRAM):
+    with socket.socket(socket.AF_INET, kind) as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+def send(port, *datagrams):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for datagram in datagrams:
+            sender.sendto(datagram, ("127.0.0.1", port))
+
+
+@contextmanager
+def sending(port, *datagrams):
+    """Send datagrams, or what functions return, 20 times per second from one port while the block runs."""
+    ended = threading.Event()
+
+    def again():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not ended.wait(0.05):
+                for one in datagrams:
+                    sender.sendto(one() if callable(one) else one, ("127.0.0.1", port))
+
+    thread = threading.Thread(target=again)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def played(street, *more):
+    """Return the words of `live` for the noise of a folder."""
+    play = "--play", street / "street.wav", "--array", street / "mics.csv", "--uncalibrated"
+    return ["live", *map(str, (*play, *more))]
+
+
+def wall(monkeypatch, images=math.inf):
+    """Replace cameras: number 0 shows a grey wall at 10 Hz, in so many images; others do not exist."""
+
+    class Capture:
+        def __init__(self, device):
+            self._left = images if device == 0 else -1
+
+        def isOpened(self):  # noqa: N802 - its name there
+            return self._left >= 0
+
+        def read(self):
+            time.sleep(0.1)
+            self._left -= 1
+            return (True, np.full((480, 640, 3), 90, np.uint8)) if self._left >= 0 else (False, None)
+
+        def release(self):
+            pass
+
+    opencv = SimpleNamespace(VideoCapture=Capture)
+    monkeypatch.setattr("worldstate.adapters.live.live_sensors.optional", lambda module: opencv)

@@ -6,11 +6,14 @@ import hmac
 import json
 import re
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
+from stand_ins import free_port, played, send, sending
 
 from worldstate.adapters.files.checkpoint_file import (
     Checkpoint,
@@ -20,6 +23,7 @@ from worldstate.adapters.files.checkpoint_file import (
 )
 from worldstate.adapters.live import live_sensors
 from worldstate.adapters.live.live_sensors import DetectionSocket, OdometrySocket, Trust
+from worldstate.adapters.state_log import read_log
 from worldstate.cli.live import _trust
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
@@ -27,36 +31,41 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.values import nanoseconds
 
 SECRET = b"sixteen bytes or more"
+LOOK = {"boxes": [], "scores": [], "classes_str": []}
 
 
-def odometry(speed_mps: float, **more: object) -> bytes:
+def odometry(speed_mps, **more):
     return json.dumps({"speed_mps": speed_mps, "yaw_rate_rad_s": 0.0, **more}).encode()
 
 
-def signed(speed_mps: float, number: int, key: bytes = SECRET, **other: object) -> bytes:
+def signed(speed_mps, number, key=SECRET, **other):
     """Return a datagram by the recipe of the page."""
     about = {"port": "odometry", "sent_s": time.time(), "number": number}
     text = odometry(speed_mps, **(about | other))
     return text + b"\n" + hmac.new(key, text, hashlib.sha256).hexdigest().encode()
 
 
-def taken(
-    trust: Trust, *sent: tuple[int, bytes], hosts=("127.0.0.1", "127.0.0.1")
-) -> tuple[list[float], str]:
+def delivered(port, until):
+    """Return what a port delivers until a condition holds, for at most 5 s."""
+    found, until_s = [], time.monotonic() + 5.0
+    while not until(found) and time.monotonic() < until_s:
+        port.deliver(lambda stamp_ns, record: found.append(record))
+        time.sleep(0.005)
+    return found
+
+
+def taken(trust, *sent, hosts=("127.0.0.1", "127.0.0.1")):
     """Send datagrams from two sockets; return the accepted speeds and the last problem."""
-    speeds: list[float] = []
-    told = OdometrySocket("127.0.0.1:0", nanoseconds, trust)
-    senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in hosts]
+    speeds, senders = [], [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in hosts]
     for sender, host in zip(senders, hosts, strict=True):
         sender.bind((host, 0))
-    with told:
+    with OdometrySocket("127.0.0.1:0", nanoseconds, trust) as told:
         for number, datagram in sent:
             # Set before sending, because the reading thread counts dropped datagrams at once.
-            done, until_s = len(speeds) + told.refused, time.monotonic() + 5.0
+            done = told.refused
             senders[number].sendto(datagram, ("127.0.0.1", told.port))
-            while len(speeds) + told.refused == done and time.monotonic() < until_s:
-                told.deliver(lambda stamp_ns, record: speeds.append(record.speed_mps))
-                time.sleep(0.005)
+            records = delivered(told, lambda found, done=done: found or told.refused > done)
+            speeds += [one.speed_mps for one in records]
     for sender in senders:
         sender.close()
     assert told.refused == len(sent) - len(speeds)
@@ -83,24 +92,19 @@ def test_only_allowed_addresses_are_accepted():
     speeds, problem = taken(Trust(allow=("127.0.0.2",)), *sent, hosts=("127.0.0.1", "127.0.0.2"))
     assert speeds == [2]
     assert "expected one of 127.0.0.2, got 127.0.0.1" in problem
-
-
-def test_hosts_are_allowed_by_name():
     asked = argparse.Namespace(allow=["localhost", "127.0.0.2"], key=None)
     assert _trust(asked).allow == ("127.0.0.1", "127.0.0.2")
     with pytest.raises(InvalidArgumentError, match="--allow: expected hosts"):
         _trust(argparse.Namespace(allow=["no such host"], key=None))
 
 
-@pytest.mark.parametrize(("age_s", "read"), [(-0.002, True), (-0.05, True), (-0.051, False), (-3600, False)])
-def test_small_negative_ages_count_as_zero(age_s, read):
-    """Clocks that differ by 2 ms lose no datagram."""
+@pytest.mark.parametrize(
+    ("age_s", "read"),
+    # Clocks that differ by 2 ms lose no datagram.
+    [(-0.002, True), (-0.05, True), *((bad, False) for bad in (-0.051, -3600, "x", None, [1], {}, True))],
+)
+def test_small_negative_ages_count_as_zero_and_others_drop_the_datagram(age_s, read):
     assert taken(Trust(), (0, odometry(1, age_s=age_s)), (0, odometry(2)))[0] == [1] * read + [2]
-
-
-@pytest.mark.parametrize("age_s", ["x", None, [1], {}, True])
-def test_an_age_that_is_no_number_is_dropped(age_s):
-    assert taken(Trust(), (0, odometry(1, age_s=age_s)), (0, odometry(2)))[0] == [2]
 
 
 def test_datagrams_with_old_numbers_are_dropped():
@@ -139,30 +143,23 @@ def test_signatures_of_other_ports_and_times_are_dropped(other, problem):
     assert re.match(problem, said), said
 
 
-def test_signatures_of_another_camera_are_dropped():
-    look = {"boxes": [], "scores": [], "classes_str": []}
-    for camera, looks in (("front", 1), ("rear", 0)):
-        seen: list[object] = []
-        with DetectionSocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET), camera) as told:
-            send(told.port, live_sensors.signed(look, SECRET, "detections/front"))
-            wait_until(lambda told=told, seen=seen: told.deliver(lambda *look: seen.append(look)) or seen)
-        assert len(seen) == looks
-        assert told.problem == ("" if looks else "port: expected 'detections/rear', got 'detections/front'")
+@pytest.mark.parametrize("camera", ["front", "rear"])
+def test_signatures_of_another_camera_are_dropped(camera):
+    with DetectionSocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET), camera) as told:
+        send(told.port, live_sensors.signed(LOOK, SECRET, "detections/front"))
+        looks = delivered(told, lambda found: found or told.refused)
+    wrong = "port: expected 'detections/rear', got 'detections/front'"
+    assert (len(looks), told.problem) == ((1, "") if camera == "front" else (0, wrong))
 
 
 def test_accepted_datagrams_are_dropped_after_a_restart():
-    first, speeds = signed(1, 7), []
-    numbers: dict[str, int] = {}
+    first, speeds, numbers = signed(1, 7), [], {}
     for datagram in (first, first, signed(2, 8)):
-        trust = Trust(key=SECRET, numbers=numbers)
-        with OdometrySocket("127.0.0.1:0", nanoseconds, trust) as told:
+        with OdometrySocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET, numbers=numbers)) as told:
             send(told.port, datagram)
-            before = len(speeds)
-            wait_until(
-                lambda told=told, before=before: (
-                    told.deliver(lambda at_ns, one: speeds.append(one.speed_mps)) or len(speeds) > before
-                )
-            )
+            speeds += [
+                one.speed_mps for one in delivered(told, lambda found, told=told: found or told.refused)
+            ]
         numbers = told.numbers
     assert speeds == [1, 2]
     assert numbers == {"odometry": 8}
@@ -170,23 +167,24 @@ def test_accepted_datagrams_are_dropped_after_a_restart():
 
 def test_numbers_are_saved_with_the_belief(tmp_path):
     save_checkpoint(tmp_path / "a.json", Checkpoint(WorldFilter(), ports=PortNumbers({"odometry": 2**62})))
-    before = read_checkpoint(tmp_path / "a.json")
-    assert _trust(argparse.Namespace(allow=[], key=None), before).numbers == {"odometry": 2**62}
-    assert _trust(argparse.Namespace(allow=[], key=None), Checkpoint(WorldFilter())).numbers == {}
+    before, nothing = read_checkpoint(tmp_path / "a.json"), argparse.Namespace(allow=[], key=None)
+    assert _trust(nothing, before).numbers == {"odometry": 2**62}
+    assert _trust(nothing, Checkpoint(WorldFilter())).numbers == {}
 
 
 def test_datagrams_of_strangers_displace_no_queued_ones():
     sent = [live_sensors.signed({"speed_mps": n, "yaw_rate_rad_s": 0.0}, SECRET, "odometry") for n in (1, 2)]
-    speeds: list[float] = []
     with OdometrySocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET)) as told:
         send(told.port, sent[0])
         for _ in range(20):
             send(told.port, *[b"rubbish"] * 50)
             time.sleep(0.01)
         send(told.port, sent[1])
-        wait_until(lambda: told.refused == 1000)
-        wait_until(lambda: told.deliver(lambda at_ns, one: speeds.append(one.speed_mps)) and len(speeds) == 2)
-    assert speeds == [1, 2]
+        until_s = time.monotonic() + 5.0
+        while told.refused < 1000 and time.monotonic() < until_s:
+            time.sleep(0.005)
+        records = delivered(told, lambda found: len(found) == 2)
+    assert [one.speed_mps for one in records] == [1, 2]
     assert (told.dropped, told.refused) == (0, 1000)
 
 
@@ -195,31 +193,66 @@ def test_the_recipe_of_the_page_is_accepted(tmp_path, monkeypatch):
     recipe = next(one for one in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "hmac.new" in one)
     (tmp_path / "secret").write_bytes(SECRET + b"\n")
     monkeypatch.chdir(tmp_path)
-    looks: list[object] = []
     with DetectionSocket("127.0.0.1:0", nanoseconds, Trust(key=SECRET)) as told:
         exec(recipe.replace("9100", str(told.port)), {})
-        wait_until(lambda: told.deliver(lambda *look: looks.append(look)) or looks)
-    assert (len(looks), told.problem) == (1, "")
-
-
-def send(port: int, *datagrams: bytes) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for datagram in datagrams:
-            sender.sendto(datagram, ("127.0.0.1", port))
-
-
-def wait_until(holds: Callable[[], object]) -> None:
-    until_s = time.monotonic() + 5.0
-    while not holds() and time.monotonic() < until_s:
-        time.sleep(0.005)
+        assert (len(delivered(told, bool)), told.problem) == (1, "")
 
 
 def test_a_short_secret_raises_an_error(street, tmp_path, capsys):
     (tmp_path / "key").write_text("short\n")
-    play = "--play", str(street / "street.wav"), "--array", str(street / "mics.csv"), "--uncalibrated"
-    assert main(["live", *play, "--odometry", "127.0.0.1:0", "--key", str(tmp_path / "key")]) == 2
+    assert main(played(street, "--odometry", "127.0.0.1:0", "--key", tmp_path / "key")) == 2
     assert "at least 16 bytes" in capsys.readouterr().err
 
 
 def test_a_secret_is_not_printed():
     assert "sixteen" not in repr(Trust(key=SECRET))
+
+
+# The requested number of datagrams per second, in bursts of 0.01 s.
+FLOOD = """
+import socket, sys, time
+port, rate, size = map(int, sys.argv[1:])
+sender, begun_s, sent = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), time.monotonic(), 0
+while True:
+    while sent < rate * (time.monotonic() - begun_s):
+        sender.sendto(b"x" * size, ("127.0.0.1", port))
+        sent += 1
+    time.sleep(0.002)
+"""
+
+
+def fresh_looks(street, folder, keyed, *flood):
+    """Return the share of hops after 2 s of 8 with a fresh look, under a flood of this rate and size."""
+    port, folder = free_port(), folder / "-".join(map(str, (0, *flood)))
+    folder.mkdir()
+    (folder / "key").write_bytes(SECRET)
+    kept = "--out", folder / "s.jsonl", "--save-state", folder / "belief.json", "--json"
+    seen = "--detections", f"127.0.0.1:{port}", "--camera", street / "lens.json", *kept, "--duration", 8
+    words = played(street, *seen, *(["--key", folder / "key"] if keyed else []))
+    process = subprocess.Popen([sys.executable, "-m", "worldstate", *words], stdout=subprocess.PIPE)
+    attack = [subprocess.Popen([sys.executable, "-c", FLOOD, str(port), *map(str, flood)])] if flood else []
+    look = LOOK | {"age_s": 0.02}
+    signing = partial(live_sensors.signed, look, SECRET, "detections")
+    with sending(port, signing if keyed else json.dumps(look).encode()):
+        told = json.loads(process.communicate(timeout=90)[0])
+    for one in attack:
+        one.kill()
+        one.wait()
+    assert told["detections_dropped"] <= 64  # before the first state
+    if flood:
+        assert told["detections_refused"] > 100
+        assert ("HMAC-SHA256" if keyed else "sender: expected 127.0.0.1") in told["last_refusal"]
+    if keyed:
+        assert read_checkpoint(folder / "belief.json").ports.last["detections"] > 0
+    states = [state for _, state in read_log(folder / "s.jsonl") if state.stamp_ns > 2_000_000_000]
+    ages_ns = [min(state.stamp_ns - look.stamp_ns for look in state.searched) for state in states]
+    return sum(age_ns <= 150_000_000 for age_ns in ages_ns) / len(ages_ns)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [7, 1_000])
+@pytest.mark.parametrize("keyed", [True, False])
+def test_a_flood_costs_at_most_a_tenth_of_the_looks(street, tmp_path, size, keyed):
+    without, under = (fresh_looks(street, tmp_path, keyed, *flood) for flood in ((), (5_000, size)))
+    print(f"keyed {keyed}, {size} bytes: {without:.3f} without, {under:.3f} under the flood")
+    assert under >= 0.9 * without

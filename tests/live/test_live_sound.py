@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import soundfile
 
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.listener import listen_steps
@@ -17,8 +16,6 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 RATE, SECONDS = 8_000, 2.0
-POSITIONS = [[0.0, 0.1, 0.0], [0.0, 0.02, 0.05], [0.0, -0.04, 0.0], [0.0, -0.1, 0.03]]
-SETTINGS = ListenSettings(uncalibrated=True)
 
 
 class Scripted:
@@ -43,27 +40,55 @@ def block(first: int, n: int = 200, captured_s: float = 0.0) -> SoundBlock:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    path = tmp_path_factory.mktemp("live") / "street.wav"
-    noise = np.random.default_rng(4).normal(0.0, 0.1, (int(SECONDS * RATE), 4))
-    soundfile.write(path, noise, RATE, subtype="PCM_16")
-    return path
-
-
-@pytest.fixture(scope="module")
-def source(recording):
-    return open_source(recording, array=MicrophoneArray(POSITIONS), settings=SETTINGS)
+def source(street):
+    bare = ListenSettings(uncalibrated=True)
+    return open_source(street / "street.wav", array=street / "mics.csv", settings=bare)
 
 
 def played(source, **options):
     return replace(source, sound=LiveSound(Playback(open_sound(source.sound), **options)))
 
 
+def test_the_oldest_item_is_dropped_and_counted():
+    channel = BoundedChannel[int](3)
+    for number in range(10):
+        channel.put(number)
+    assert [channel.take() for _ in range(3)] == [7, 8, 9]
+    assert channel.dropped == 7
+
+
+def test_queued_items_precede_end_and_error_and_later_ones_are_ignored():
+    channel = BoundedChannel[int](3)
+    channel.put(1)
+    channel.close(InputFileError("device", "unplugged"))
+    channel.put(2)
+    assert channel.take() == 1
+    for take in (channel.take, channel.take_all):
+        with pytest.raises(InputFileError, match="unplugged"):
+            take()
+    assert channel.dropped == 0
+
+
+def test_items_and_the_end_wake_a_waiting_thread():
+    channel = BoundedChannel[int](2)
+    taken = []
+    waiting = threading.Thread(target=lambda: taken.extend([channel.take(), channel.take()]))
+    waiting.start()
+    channel.put(5)
+    channel.close()
+    waiting.join(timeout=5.0)
+    assert taken == [5, None]
+
+
+def heard(sound):
+    return np.concatenate(list(sound.blocks()))
+
+
 def test_lost_samples_become_silence_of_the_same_length():
     sound = LiveSound(Scripted(block(0), block(500), block(700)))
-    heard = np.concatenate(list(sound.blocks()))
-    assert len(heard) == 900 == sound.frames
-    assert np.flatnonzero(~heard.any(axis=1)).tolist() == list(range(200, 500))
+    found = heard(sound)
+    assert len(found) == 900 == sound.frames
+    assert np.flatnonzero(~found.any(axis=1)).tolist() == list(range(200, 500))
     assert sound.lost_samples == 300
     assert sound.lost_s == pytest.approx(300 / RATE)
 
@@ -88,9 +113,9 @@ def test_lost_samples_become_silence_of_the_same_length():
 )
 def test_blocks_out_of_order_are_dropped_and_counted(wrong):
     sound = LiveSound(Scripted(block(0), wrong, block(200)))
-    heard = np.concatenate(list(sound.blocks()))
-    assert heard.shape == (400, 4)
-    assert heard.all()
+    found = heard(sound)
+    assert found.shape == (400, 4)
+    assert found.all()
     assert (sound.refused, sound.lost_samples) == (1, 0)
 
 
@@ -99,9 +124,9 @@ def test_invalid_samples_become_silence_of_their_microphone(sample):
     wrong = block(200)
     wrong.samples[7, 2] = sample
     sound = LiveSound(Scripted(block(0), wrong))
-    heard = np.concatenate(list(sound.blocks()))
-    assert np.argwhere(heard == 0.0).tolist() == [[207, 2]]
-    assert np.isfinite(heard).all()
+    found = heard(sound)
+    assert np.argwhere(found == 0.0).tolist() == [[207, 2]]
+    assert np.isfinite(found).all()
     assert sound.refused == 1
 
 
@@ -147,9 +172,9 @@ def test_a_stalling_microphone_gives_states_in_time(source):
 
 def test_a_device_that_restarts_its_count_is_read_again():
     sound = LiveSound(Stalling(120, hold=[40], restart=True))
-    heard = np.concatenate(list(sound.blocks()))
-    assert heard[-200:].all()
-    assert len(heard) == pytest.approx(3.0 * RATE, abs=0.2 * RATE)
+    found = heard(sound)
+    assert found[-200:].all()
+    assert len(found) == pytest.approx(3.0 * RATE, abs=0.2 * RATE)
     assert 10 < sound.refused < 40
 
 
@@ -178,25 +203,25 @@ def test_a_failing_user_function_is_counted_and_the_run_continues(source, given,
 def test_unread_blocks_are_overruns():
     feed = Scripted(*(block(200 * number) for number in range(100)))
     sound = LiveSound(feed)
-    heard = np.concatenate(list(sound.blocks()))
+    found = heard(sound)
     # At most 80 blocks of 25 ms are queued, so twenty were dropped, and the others keep their time.
     assert sound.overruns == 20
-    assert len(heard) == 100 * 200
-    assert not heard[: 20 * 200].any()
-    assert heard[20 * 200 :].all()
+    assert len(found) == 100 * 200
+    assert not found[: 20 * 200].any()
+    assert found[20 * 200 :].all()
     assert feed.stopped
 
 
 def test_after_lost_seconds_the_time_is_kept():
     kept = []
     sound = LiveSound(Scripted(*(block(200 * number) for number in range(140))), kept.append)
-    heard = np.concatenate(list(sound.blocks()))
+    found = heard(sound)
     # Sixty blocks were dropped, then all queued ones but the newest.
     assert sound.overruns == 139
-    assert 0.9 * RATE <= len(heard) - 200 < RATE
-    assert not heard[:-200].any() and heard[-200:].all()
+    assert 0.9 * RATE <= len(found) - 200 < RATE
+    assert not found[:-200].any() and found[-200:].all()
     assert sound.start_ns % 10**8 == 0
-    assert sound.start_ns == pytest.approx((140 * 200 - len(heard)) / RATE * 1e9)
+    assert sound.start_ns == pytest.approx((140 * 200 - len(found)) / RATE * 1e9)
     assert sound.lost_samples == 139 * 200 and sum(map(len, kept)) == 140 * 200
 
 
@@ -209,7 +234,7 @@ def test_an_image_is_stamped_on_the_clock_of_the_sound():
 
 
 def test_a_wrong_number_of_channels_raises_an_error(source):
-    three = replace(source, sound=LiveSound(Scripted()), array=MicrophoneArray(POSITIONS[:3]))
+    three = replace(source, sound=LiveSound(Scripted()), array=MicrophoneArray(source.array.positions_m[:3]))
     with pytest.raises(InputFileError, match="expected 3 channels, one per microphone, got 4"):
         list(live_steps(three))
 

@@ -9,11 +9,14 @@ import threading
 import time
 from collections import Counter
 from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from snapshot_laws import broken_laws
+from stand_ins import free_port, send
 
 from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
@@ -42,13 +45,21 @@ RANGES = (
 )  # fmt: skip
 SPEEDS = ({"speed_mps": 1e30}, {"speed_mps": float("nan")}, {"speed_mps": 1, "x_m": 3}, {"speed_mps": None})
 SAMPLES = np.nan, np.inf, -1e30, 1e6, 0.5
-# Wrong values of a user's callback in place of boxes.
-GIVEN = (
-    None,
-    RuntimeError("a detector that fails"),
-    "boxes",
-    DetectionFrame(np.zeros((0, 4)), np.zeros(0), ()),
-)
+EMPTY = DetectionFrame(np.zeros((0, 4)), np.zeros(0), ())
+# Wrong values of a user's callback in place of boxes, and right ones.
+GIVEN = None, RuntimeError("a detector that fails"), "boxes", EMPTY
+
+
+# Blocks that are given in place of one.
+REPLACED = {
+    "block_lost": lambda block: [],
+    "block_repeated": lambda block: [block, block],
+    "count_jumps_back": lambda block: [replace(block, first=block.first - 1_000_000)],
+    "count_jumps_ahead": lambda block: [replace(block, first=block.first + 10**9)],
+    "channels_missing": lambda block: [replace(block, samples=block.samples[:, :2])],
+    "clock_jumps_ahead": lambda block: [replace(block, captured_s=block.captured_s + 3600.0)],
+    "clock_jumps_back": lambda block: [replace(block, captured_s=block.captured_s - 3600.0)],
+}
 
 
 class Faulty:
@@ -60,11 +71,12 @@ class Faulty:
         self.ports, self.websocket, self._key, self._length_s = ports, websocket, key, length_s
         # Blocks between two faults: one second of a long run
         self.every = 40 if length_s > 60.0 else 14
-        self.kinds = [name for name in vars(Faulty) if name.startswith("_fault_")]
+        own = {name[7:]: fault for name, fault in vars(Faulty).items() if name.startswith("_fault_")}
+        self.kinds = REPLACED | {name: partial(fault, self) for name, fault in own.items()}
         self.faults, self.bytes, self.images = Counter[str](), list[int](), image_channel()
         self._rng, self._stopped = np.random.default_rng(5), threading.Event()
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._dripping, self._held, self._ahead = list[socket.socket](), list[SoundBlock](), list[int]()
+        self._dripping, self._ahead = list[socket.socket](), list[int]()
         self._last, self._incoherent = b"", False
 
     def start(self, into) -> None:
@@ -94,7 +106,7 @@ class Faulty:
             for far_ns in self._ahead[:]:
                 self._ahead.remove(far_ns)
                 stamp_ns = source.sound.stamp_ns(time.monotonic()) + far_ns
-                listener.look(stamp_ns, DetectionFrame(np.zeros((0, 4)), np.zeros(0), ()))
+                listener.look(stamp_ns, EMPTY)
                 listener.add(Odometry("far", stamp_ns, 0.0, 0.0))
             return looks.deliver(listener.look)
 
@@ -109,9 +121,9 @@ class Faulty:
             if number % self.every == self.every - 1:
                 self._disturb()
             if number % self.every == self.every - 1 and number < 40 * (self._length_s - 3.0):
-                kind = self.kinds[self.faults.total() % len(self.kinds)]
-                self.faults[kind.removeprefix("_fault_")] += 1
-                given = getattr(self, kind)(blocks[0])
+                kind = [*self.kinds][self.faults.total() % len(self.kinds)]
+                self.faults[kind] += 1
+                given = self.kinds[kind](blocks[0])
                 blocks = blocks if given is None else given
             for block in blocks:
                 into.put(block)
@@ -153,41 +165,14 @@ class Faulty:
         resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
     def _rubbish(self, datagrams: int) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            for number in range(2 * datagrams):
-                stranger.sendto(b"rubbish", ("127.0.0.1", self.ports[number % 2]))
-
-    def _spoilt(self, block: SoundBlock, first: int = 0, captured_s: float = 0.0) -> SoundBlock:
-        return SoundBlock(block.samples, block.first + first, block.captured_s + captured_s)
-
-    # Each returns the replacement of a block, or None for the block itself.
+        for port in self.ports:
+            send(port, *[b"rubbish"] * datagrams)
 
     def _fault_samples_out_of_range(self, block):
         block.samples[7, self.faults.total() % 4] = SAMPLES[self.faults.total() % len(SAMPLES)]
 
-    def _fault_block_lost(self, block):
-        return []
-
-    def _fault_block_repeated(self, block):
-        return [block, block]
-
-    def _fault_count_jumps_back(self, block):
-        return [self._spoilt(block, first=-1_000_000)]
-
-    def _fault_count_jumps_ahead(self, block):
-        return [self._spoilt(block, first=10**9)]
-
-    def _fault_channels_missing(self, block):
-        return [SoundBlock(block.samples[:, :2], block.first, block.captured_s)]
-
     def _fault_stall_and_burst(self, block):
         self._stopped.wait(0.7)  # the delayed blocks arrive at once
-
-    def _fault_clock_jumps_ahead(self, block):
-        return [self._spoilt(block, captured_s=3600.0)]
-
-    def _fault_clock_jumps_back(self, block):
-        return [self._spoilt(block, captured_s=-3600.0)]
 
     def _fault_incoherent_noise(self, block):
         self._incoherent = True
@@ -245,12 +230,6 @@ class Faulty:
 live_steps = live_listening.live_steps
 
 
-def free_port(kind=socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
-
-
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize(
     ("length_s", "key"),
@@ -269,21 +248,12 @@ def test_a_run_with_a_fault_every_second_continues(
     monkeypatch.setattr(live_listening, "live_steps", feed.beside)
     (tmp_path / "key").write_bytes(SECRET)
     (tmp_path / "kept").mkdir()
-    told = ["--detections", f"127.0.0.1:{ports[0]}", "--odometry", f"127.0.0.1:{ports[1]}"]
-    given = [
-        "--array",
-        str(street / "mics.csv"),
-        "--camera",
-        str(street / "lens.json"),
-        "--rate",
-        str(RATE),
-        "--uncalibrated",
-        *told,
-    ]
-    kept = ["--out", "s.jsonl", "--export", "mcap=s.mcap", "--save-state", "belief.json"]
-    ends = ["--export", f"foxglove={websocket}", "--duration", str(length_s), "--json"]
+    given = f"--array {street}/mics.csv --camera {street}/lens.json --rate {RATE} --uncalibrated"
+    told = f"--detections 127.0.0.1:{ports[0]} --odometry 127.0.0.1:{ports[1]} {'--key key' if key else ''}"
+    kept = "--out s.jsonl --export mcap=s.mcap --save-state belief.json"
+    ends = f"--export foxglove={websocket} --duration {length_s} --json"
     monkeypatch.chdir(tmp_path)
-    assert main(["live", *given, *kept, *ends, *(["--key", "key"] if key else [])]) == 0
+    assert main(["live", *given.split(), *told.split(), *kept.split(), *ends.split()]) == 0
     printed = capsys.readouterr()
     report, faults = json.loads(printed.out), feed.faults.total()
     lost = sum(int(one) for one in re.findall(r"s\.jsonl: (\d+) records were lost", caplog.text))
@@ -294,7 +264,7 @@ def test_a_run_with_a_fault_every_second_continues(
     with capsys.disabled():
         print(json.dumps(report | figures, indent=1) if length_s > 60.0 else "", end="")
     assert "Traceback" not in printed.err
-    assert set(feed.faults) == {name.removeprefix("_fault_") for name in feed.kinds}
+    assert set(feed.faults) == set(feed.kinds)
     assert faults >= 0.9 * 40 / feed.every * (length_s - 3.0) - 1
     assert report["detections_refused"] + report["odometry_refused"] > 100 * faults
     # A machine with more work than cores is too slow, and its losses are counted.

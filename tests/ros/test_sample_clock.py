@@ -2,23 +2,23 @@
 
 import io
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_messages import Message, bag_of, block, box, image, info, moved, pcm, sound_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.adapters.audio.sound_file import RawPcm, open_sound
 from worldstate.adapters.ros.bag_input import is_bag, read_bag, read_sound
-from worldstate.adapters.ros.bag_writer import bag_writer
-from worldstate.adapters.ros.message_types import header
 from worldstate.adapters.ros.sample_clock import begins_again, contradiction, lost_before
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.typing import FloatArray, IntArray
 
-MS, SECOND = 10**6, 10**9
+MS, TENTH_NS, SECOND = 10**6, 10**8, 10**9
 T0 = 1_700_000_000 * SECOND
 
 
@@ -109,32 +109,26 @@ def test_a_repeated_bag_continues_the_count(passes: int, count: int) -> None:
     assert found == [(k * count, k * count * 10 * MS) for k in range(1, passes)]
 
 
-INFO = {"channels": 4, "sample_rate": 8000, "sample_format": "S16LE", "coding_format": "wave"}
 SOUND = np.random.default_rng(1).integers(-9000, 9000, (6 * 8000, 4), dtype=np.int16)
 FORMAT = RawPcm(io.BytesIO(), 8000, 4, "s16")
 
 
-def write_bag(
-    path: Path,
+def spoken(
     stamps: IntArray,
-    *,
-    step: int = 640,
     recorded: IntArray | None = None,
-    info: object = True,
-    **storage: str,
-) -> Path:
-    """Write 6 s in messages of so many bytes, stamped at their beginning; -1 is no stamp."""
-    data, kind = SOUND.tobytes(), "AudioDataStamped"
+    step: int = 640,
+    data: bytes = SOUND.tobytes(),
+    **about: object,
+) -> Iterator[Message]:
+    """Yield sound in messages of so many bytes, stamped at their beginning; -1 is no stamp."""
     recorded = stamps if recorded is None else recorded
-    with bag_writer(path, **storage) as write:
-        if info is not False:
-            about = INFO | (info if isinstance(info, dict) else {})
-            write("/info", "audio_common_msgs/msg/AudioInfo", int(recorded.min()) - 1, about)
-        for k, (stamp_ns, recorded_ns) in enumerate(zip(stamps, recorded, strict=True)):
-            piece = np.frombuffer(data[k * step : (k + 1) * step], np.uint8)
-            values = {"header": header(max(int(stamp_ns), 0)), "audio": {"data": piece}}
-            write("/audio", f"audio_common_msgs/msg/{kind}", int(recorded_ns), values)
-    return path
+    yield info(int(recorded.min()) - 1, **about)
+    for k, (stamp_ns, recorded_ns) in enumerate(zip(stamps.tolist(), recorded.tolist(), strict=True)):
+        yield pcm(data[k * step : (k + 1) * step], stamp_ns, recorded_ns)
+
+
+def begins(step: int) -> IntArray:
+    return T0 + np.arange(-(-SOUND.nbytes // step)) * step * SECOND // (8 * 8000)
 
 
 def heard(path: Path, stated: RawPcm | None = None) -> np.ndarray:
@@ -147,12 +141,11 @@ def heard(path: Path, stated: RawPcm | None = None) -> np.ndarray:
 @pytest.mark.parametrize("kind", [*KINDS, "zero", "a loop"])
 def test_every_sample_of_a_bag_is_read(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     stamps = late(kind, 600, 10 * MS, np.random.default_rng(3))
-    recorded = even(600)[0] + 3 * MS
     if kind == "zero":
         stamps[:] = -1
     elif kind == "a loop":
         stamps = np.tile(stamps[:300], 2)
-    path = write_bag(tmp_path / "bag", stamps, recorded=recorded)
+    path = bag_of(tmp_path / "bag", spoken(stamps, even(600)[0] + 3 * MS))
     np.testing.assert_array_equal(heard(path), SOUND)
     assert "missing" not in caplog.text
     assert ("begin again at 3.000 s" in caplog.text) is (kind == "a loop")
@@ -162,97 +155,91 @@ def test_every_sample_of_a_bag_is_read(kind: str, tmp_path: Path, caplog: pytest
 def test_samples_may_be_split_between_messages(
     step: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    stamps = T0 + np.arange(-(-SOUND.nbytes // step)) * step * SECOND // (8 * 8000)
-    np.testing.assert_array_equal(heard(write_bag(tmp_path / "whole", stamps, step=step)), SOUND)
+    path = bag_of(tmp_path / "whole", spoken(begins(step), step=step))
+    np.testing.assert_array_equal(heard(path), SOUND)
     assert not caplog.text
 
 
 @pytest.mark.parametrize("step", [1001, 1277])
 def test_a_lost_message_does_not_shift_channels(step: int, tmp_path: Path) -> None:
     """Messages may split samples; later samples keep their channels."""
-    count = -(-SOUND.nbytes // step)
-    stamps, lost = T0 + np.arange(count) * step * SECOND // (8 * 8000), range(40, 43)
-    data, path = SOUND.tobytes(), tmp_path / "bag"
-    with bag_writer(path) as write:
-        write("/info", "audio_common_msgs/msg/AudioInfo", T0 - 1, INFO)
-        for k in set(range(count)) - set(lost):
-            piece = np.frombuffer(data[k * step : (k + 1) * step], np.uint8)
-            values = {"header": header(int(stamps[k])), "audio": {"data": piece}}
-            write("/audio", "audio_common_msgs/msg/AudioDataStamped", int(stamps[k]), values)
-    found = heard(path)
+    messages = [*spoken(begins(step), step=step)]
+    del messages[41:44]
+    found = heard(bag_of(tmp_path / "bag", messages))
     assert len(found) == len(SOUND)
     same = (found == SOUND).all(axis=1)
     assert same[: 40 * step // 8 - 1].all() and same[43 * step // 8 + 1 :].all()
 
 
 def test_a_repeated_bag_shifts_boxes_and_odometry(tmp_path: Path) -> None:
-    stamps = np.tile(even(300)[0], 2)
-    recorded = even(600)[0] + 3 * MS
-    data, step, path = SOUND.tobytes(), 640, tmp_path / "bag"
-    with bag_writer(path) as write:
-        write("/info", "audio_common_msgs/msg/AudioInfo", T0 - 1, INFO)
-        for k in range(600):
-            piece = np.frombuffer(data[k * step : (k + 1) * step], np.uint8)
-            values = {"header": header(int(stamps[k])), "audio": {"data": piece}}
-            write("/audio", "audio_common_msgs/msg/AudioDataStamped", int(recorded[k]), values)
-            if k % 10 == 5:
-                twist = {"twist": {"linear": {"x": 0.1 * k}}}
-                at = header(int(stamps[k]))
-                write("/boxes", "vision_msgs/msg/Detection2DArray", int(recorded[k]) + 1, {"header": at})
-                write("/odom", "nav_msgs/msg/Odometry", int(recorded[k]) + 1, {"header": at, "twist": twist})
-    held = read_bag(path)
+    stamps, recorded, seen = np.tile(even(300)[0], 2), even(600)[0] + 3 * MS, range(5, 600, 10)
+    images = [image(int(stamps[k]), int(recorded[k]) + 1) for k in seen]
+    driven = [moved(int(stamps[k]), int(recorded[k]) + 1, 0.1 * k) for k in seen]
+    held = read_bag(bag_of(tmp_path / "bag", [*spoken(stamps, recorded), *images, *driven]))
     assert held.detections is not None and held.ego is not None
-    wanted = [T0 + k * 10 * MS for k in range(5, 600, 10)]
+    wanted = [T0 + k * 10 * MS for k in seen]
     assert held.detections.stamps_ns.tolist() == wanted
     assert [one.stamp_ns for one in held.ego.told] == wanted
     np.testing.assert_allclose([one.speed_mps for one in held.ego.told], 0.1 * np.arange(5, 600, 10))
 
 
-def test_disordered_boxes_and_odometry_cost_only_themselves(tmp_path: Path) -> None:
-    stamps, _ = even(600)
-    order = [0, 2, 1, 3, 3, 4]
-    data, path = SOUND.tobytes(), tmp_path / "bag"
-    with bag_writer(path) as write:
-        write("/info", "audio_common_msgs/msg/AudioInfo", T0 - 1, INFO)
-        values = {"header": header(T0), "audio": {"data": np.frombuffer(data, np.uint8)}}
-        write("/audio", "audio_common_msgs/msg/AudioDataStamped", T0, values)
-        for k, place in enumerate(order):
-            at = header(int(stamps[place * 10]))
-            write("/boxes", "vision_msgs/msg/Detection2DArray", T0 + k, {"header": at})
-            write("/odom", "nav_msgs/msg/Odometry", T0 + k, {"header": at})
-    held = read_bag(path)
-    assert held.detections is not None and held.ego is not None
-    assert (
-        held.detections.stamps_ns.tolist()
-        == [one.stamp_ns for one in held.ego.told]
-        == stamps[:50:10].tolist()
-    )
+# Tenths of a second of the stamps of detections and odometry, or None; all are recorded.
+STAMPED = {
+    "as they were": lambda k: k,
+    "not at all": lambda k: None,
+    "some not": lambda k: None if k % 3 == 1 else k,
+    "out of order": lambda k: k ^ 1,
+    "all alike": lambda k: 0,
+    "ten alike": lambda k: k // 10 * 10,
+    "delivered twice": lambda k: k // 2 * 2,
+}
+
+
+@pytest.mark.parametrize("name", STAMPED)
+def test_bad_stamps_lose_no_boxes_or_odometry(
+    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages = list[Message]()
+    for k in range(40):
+        recorded_ns, tenth = 3 * SECOND + k * TENTH_NS, STAMPED[name](k)
+        stamp_ns = 0 if tenth is None else 3 * SECOND + tenth * TENTH_NS
+        found = [box(10.0 + k, 20, 30, 40, "car", 0.8)] * (k > 0)
+        messages += [block(sound_of(800), recorded_ns), image(stamp_ns, recorded_ns, *found)]
+        messages.append(moved(stamp_ns, recorded_ns, 0.1 * k))
+    held = read_bag(bag_of(tmp_path / "bag", messages))
+    assert held.detections is not None and held.ego is not None and held.ego.moves and held.array is None
+    kept = range(1, 40, 2) if name == "delivered twice" else range(40)
+    order = [k ^ 1 for k in kept] if name == "out of order" else [*kept]
+    boxes = [frame.boxes_px.tolist() for frame in held.detections.frames]
+    # An image without boxes was searched.
+    assert boxes == [[[10.0 + k, 20.0, 40.0 + k, 60.0]] * (k > 0) for k in order]
+    assert {(*frame.labels, *frame.scores) for frame in held.detections.frames} <= {(), ("car", 0.8)}
+    assert [round(10 * one.speed_mps) for one in held.ego.told] == order
+    times = [(ns - 3 * SECOND) // TENTH_NS for ns in held.detections.stamps_ns.tolist()]
+    assert times == [one.stamp_ns // TENTH_NS - 30 for one in held.ego.told]
+    assert times == [k - (name == "delivered twice") for k in kept]
+    assert ("do not advance" in caplog.text) is (name in ("all alike", "ten alike"))
 
 
 @pytest.mark.parametrize(
-    ("case", "info", "stretch", "said"),
+    ("info", "stretch", "said"),
     [
-        ("a third of the rate", {"sample_rate": 2667}, 1, "stamps advance by 6.0 s while 18.0 s of samples"),
-        (
-            "three times the rate",
-            {"sample_rate": 24_000},
-            1,
-            "stamps advance by 6.0 s while 2.0 s of samples",
-        ),
-        ("passes that were mixed", {}, 2, "stamps advance by 3.0 s while 6.0 s of samples were sent"),
+        ({"sample_rate": 2667}, 1, "stamps advance by 6.0 s while 18.0 s of samples"),
+        ({"sample_rate": 24_000}, 1, "stamps advance by 6.0 s while 2.0 s of samples"),
+        ({}, 2, "stamps advance by 3.0 s while 6.0 s of samples were sent"),  # mixed passes
     ],
 )
 def test_stamps_that_contradict_the_rate_raise_an_error(
-    case: str, info: dict[str, int], stretch: int, said: str, tmp_path: Path
+    info: dict[str, int], stretch: int, said: str, tmp_path: Path
 ) -> None:
-    path = write_bag(tmp_path / "bag", T0 + np.arange(600) // stretch * 10 * MS, info=info)
+    path = bag_of(tmp_path / "bag", spoken(T0 + np.arange(600) // stretch * 10 * MS, **info))
     with pytest.raises(InputFileError, match=re.escape(said) + ".*--topic"):
         read_sound(path)
 
 
 def test_the_audio_format_can_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bare = write_bag(tmp_path / "bare", even(600)[0], info=False)
-    wrong = write_bag(tmp_path / "wrong", even(600)[0], info={"sample_rate": 24_000})
+    bare = bag_of(tmp_path / "bare", [*spoken(even(600)[0])][1:])
+    wrong = bag_of(tmp_path / "wrong", spoken(even(600)[0], sample_rate=24_000))
     array = tmp_path / "ring.csv"
     array.write_text("0.05,0,0\n0,0.05,0\n-0.05,0,0\n0,-0.05,0\n")
     with pytest.raises(InputFileError, match=r"AudioInfo.* or --topic audio=.*:RATE:CHANNELS:FORMAT"):
@@ -270,43 +257,29 @@ def test_the_audio_format_can_be_given(tmp_path: Path, capsys: pytest.CaptureFix
     assert "topics: expected a bag" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_folder_without_metadata_is_read_from_its_files(
-    storage: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("storage", "way"), [("mcap", "`mcap recover"), ("sqlite3", "`sqlite3 IN .recover")])
+def test_incomplete_bags_are_read_or_name_the_command_that_mends_them(
+    storage: str, way: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = write_bag(tmp_path / "bag", even(600)[0], storage=storage)
+    path = bag_of(tmp_path / "bag", spoken(even(600)[0]), storage)
     (path / "metadata.yaml").unlink()
     assert is_bag(path)
     np.testing.assert_array_equal(heard(path), SOUND)
     assert "metadata.yaml is missing, `ros2 bag reindex` writes it" in caplog.text
-    (path / "out_multi.wav").touch()
-    assert not is_bag(path), "a recording with a log beside it"
-
-
-@pytest.mark.parametrize(("storage", "way"), [("mcap", "`mcap recover"), ("sqlite3", "`sqlite3 IN .recover")])
-def test_a_truncated_bag_raises_an_error_with_the_recovery_command(
-    storage: str, way: str, tmp_path: Path
-) -> None:
-    path = write_bag(tmp_path / "bag", even(600)[0], storage=storage)
-    (file,) = (one for one in path.iterdir() if one.suffix != ".yaml")
+    (file,) = path.iterdir()
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     for name in (file, path):
         with pytest.raises(InputFileError, match=re.escape(way)):
             heard(name)
+    (path / "out_multi.wav").touch()
+    assert not is_bag(path), "a recording with a log beside it"
 
 
 def test_24_bit_samples_in_four_bytes_are_detected(tmp_path: Path) -> None:
     wide = np.random.default_rng(2).normal(0.0, 1e5, (16_000, 4)).astype("<i4")
-    for said, right in (("S24LE", False), ("S24_32LE", True)):
-        path = tmp_path / said
-        with bag_writer(path) as write:
-            write("/info", "audio_common_msgs/msg/AudioInfo", T0 - 1, INFO | {"sample_format": said})
-            for k in range(20):
-                piece = np.frombuffer(wide[800 * k : 800 * (k + 1)].tobytes(), np.uint8)
-                values = {"header": header(T0 + k * 100 * MS), "audio": {"data": piece}}
-                write("/audio", "audio_common_msgs/msg/AudioDataStamped", T0 + k * 100 * MS, values)
-        if right:
-            np.testing.assert_allclose(heard(path) * 256, wide, atol=1e-2)
-        else:
-            with pytest.raises(InputFileError, match=r"expected samples of s24, got .* like those of s24_32"):
-                read_sound(path)
+    stamps, each = T0 + np.arange(20) * TENTH_NS, {"step": 12_800, "data": wide.tobytes()}
+    right = bag_of(tmp_path / "right", spoken(stamps, **each, sample_format="S24_32LE"))
+    np.testing.assert_allclose(heard(right) * 256, wide, atol=1e-2)
+    wrong = bag_of(tmp_path / "wrong", spoken(stamps, **each, sample_format="S24LE"))
+    with pytest.raises(InputFileError, match=r"expected samples of s24, got .* like those of s24_32"):
+        read_sound(wrong)
