@@ -4,16 +4,15 @@ import argparse
 import io
 import json
 import math
-import os
 import re
 import socket
-import subprocess
 import threading
 import time
 import uuid
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,6 +30,7 @@ from worldstate.adapters.export.other_stacks import (
     lane_objects,
     osi_sensor_data,
 )
+from worldstate.adapters.ros.message_types import OBJECTS, typestore
 from worldstate.cli.common.exports import open_exports
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
@@ -170,53 +170,25 @@ def test_a_drive_does_not_move_what_is_seen_across_the_road(azimuth, rate, speed
     assert one.velocity_mps[0] == pytest.approx(0.0, abs=1e-9), "over ground it stays in its lane"
 
 
-# As the .msg files of autoware_perception_msgs, geometry_msgs and unique_identifier_msgs say.
-MESSAGES = {
-    "PredictedObjects": "Header header; PredictedObject[] objects",
-    "Header": "Time stamp; string frame_id",
-    "Time": "int32 sec; uint32 nanosec",
-    "Duration": "int32 sec; uint32 nanosec",
-    "PredictedObject": "UUID object_id; float32 existence_probability; "
-    "ObjectClassification[] classification; PredictedObjectKinematics kinematics; Shape shape",
-    "UUID": "uint8[16] uuid",
-    "ObjectClassification": "uint8 label; float32 probability",
-    "PredictedObjectKinematics": "PoseWithCovariance initial_pose_with_covariance; "
-    "TwistWithCovariance initial_twist_with_covariance; "
-    "AccelWithCovariance initial_acceleration_with_covariance; PredictedPath[] predicted_paths",
-    "PoseWithCovariance": "Pose pose; float64[36] covariance",
-    "TwistWithCovariance": "Twist twist; float64[36] covariance",
-    "AccelWithCovariance": "Accel accel; float64[36] covariance",
-    "Pose": "Point position; Quaternion orientation",
-    "Point": "float64 x; float64 y; float64 z",
-    "Vector3": "float64 x; float64 y; float64 z",
-    "Quaternion": "float64 x; float64 y; float64 z; float64 w",
-    "Twist": "Vector3 linear; Vector3 angular",
-    "Accel": "Vector3 linear; Vector3 angular",
-    "PredictedPath": "Pose[] path; Duration time_step; float32 confidence",
-    "Shape": "uint8 type; Polygon footprint; Vector3 dimensions",
-    "Polygon": "Point32[] points",
-    "Point32": "float32 x; float32 y; float32 z",
-}
 RANGES = {"uint8": (0, 255), "int32": (-(2**31), 2**31 - 1), "uint32": (0, 2**32 - 1)}
 
 
 def check(kind, value):
-    name, many, count = re.fullmatch(r"(\w+?)(\[(\d*)\])?", kind).groups()
-    if many:
-        assert isinstance(value, list)
-        assert not count or len(value) == int(count)
-        for one in value:
-            check(name, one)
-    elif name in MESSAGES:
-        wanted = dict(reversed(field.split()) for field in MESSAGES[name].split("; "))
-        assert list(value) == list(wanted), f"the fields of {name}"
-        for field, field_kind in wanted.items():
-            check(field_kind, value[field])
-    elif name in RANGES:
-        assert type(value) is int
-        assert RANGES[name][0] <= value <= RANGES[name][1]
+    """Check a value by the definitions of ROS, in which a list may have a fixed length."""
+    node, about = kind
+    if node.name == "NAME":
+        fields = dict(typestore().fielddefs[about][1])
+        assert list(value) == list(fields), f"the fields of {about}"
+        for name, one in value.items():
+            check(fields[name], one)
+    elif node.name == "BASE" and about[0] in RANGES:
+        assert type(value) is int and RANGES[about[0]][0] <= value <= RANGES[about[0]][1]
+    elif node.name == "BASE":
+        assert type(value) is (str if about[0] == "string" else float)
     else:
-        assert type(value) is {"string": str}.get(name, float)
+        assert isinstance(value, list) and (node.name == "SEQUENCE" or len(value) == about[1])
+        for one in value:
+            check(about[0], one)
 
 
 def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lane(log, tmp_path):
@@ -225,7 +197,7 @@ def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lan
     assert len(lines) == len(STATES)
     for line, state in zip(lines, STATES, strict=True):
         message = json.loads(line)
-        check("PredictedObjects", message)
+        check((SimpleNamespace(name="NAME"), OBJECTS), message)
         ids = [str(uuid.UUID(bytes=bytes(one["object_id"]["uuid"]))) for one in message["objects"]]
         assert ids == [one.id for one in state.entities if one.moving]
         assert message["header"]["frame_id"] == "map"
@@ -262,39 +234,25 @@ def test_an_object_stands_in_the_map_where_the_car_sees_it_and_is_as_uncertain_a
     assert trace == pytest.approx(0.25 + 1.0 + 2 * 0.09 + 0.01 * range_m**2)
 
 
-@pytest.mark.parametrize("ego", [None, replace(EGO, localised=False)])
-def test_objects_of_a_car_that_is_nowhere_in_the_map_are_refused(ego, tmp_path, capsys):
-    (tmp_path / "states.jsonl").write_text(replace(HIDDEN, ego=ego).to_json() + "\n")
-    out = tmp_path / "objects.jsonl"
-    assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", f"autoware={out}"]) == 2
-    assert "expected odometry with x_m, y_m and yaw_rad" in capsys.readouterr().err
-    assert not out.exists()
-
-
-def test_a_pose_that_is_lost_on_the_way_leaves_states_out(tmp_path):
-    states = [HIDDEN, replace(HIDDEN, seq=90, ego=None), PLACED]
-    (tmp_path / "states.jsonl").write_text("".join(state.to_json() + "\n" for state in states))
-    out = tmp_path / "objects.jsonl"
-    assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", f"autoware={out}"]) == 0
-    assert len(out.read_text().splitlines()) == 2
-
-
-def exporting(export, live=True, **options):
-    asked = {"export": [export], "origin": [], "rotate_mib": None, "odometry": None} | options
+def exporting(export, live=True, odometry=None):
+    asked = {"export": [export], "origin": [], "rotate_mib": None, "odometry": odometry}
     return open_exports(argparse.Namespace(**asked), live=live)
 
 
-def test_a_pose_that_a_running_localiser_has_not_told_yet_does_not_end_a_live_run(tmp_path):
-    out = tmp_path / "objects.jsonl"
-    with exporting(f"autoware={out}", odometry="127.0.0.1:9000") as exports:
-        for state in (replace(HIDDEN, ego=None), PLACED):
-            exports.state(state)
-    assert len(out.read_text().splitlines()) == 1
-    with (
-        pytest.raises(InvalidArgumentError, match="expected odometry"),
-        exporting(f"autoware={out}") as exports,
-    ):
-        exports.state(replace(HIDDEN, ego=None))
+@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize("ego", [None, replace(EGO, localised=False)])
+def test_objects_of_a_car_that_is_nowhere_in_the_map_are_refused(ego, live, tmp_path):
+    nowhere, out = replace(HIDDEN, ego=ego), tmp_path / "objects.jsonl"
+    words = "expected odometry with x_m, y_m and yaw_rad"
+    with pytest.raises(InvalidArgumentError, match=words), exporting(f"autoware={out}", live) as exports:
+        exports.state(nowhere)
+    assert live or not out.exists()
+    # A pose that is lost on the way, or that a running localiser has not sent yet, ends no run.
+    for first, odometry in [(HIDDEN, None)] + [(nowhere, "127.0.0.1:9000")] * live:
+        with exporting(f"autoware={out}", live, odometry) as exports:
+            for state in (first, replace(nowhere, seq=90), PLACED):
+                exports.state(state)
+        assert len(out.read_text().splitlines()) == 1 + (first is HIDDEN)
 
 
 @pytest.mark.parametrize("target", ["autoware=out.jsonl", "mot=out.txt", "osi=out.osi", "osi=out.mcap"])
@@ -359,20 +317,17 @@ def test_who_is_only_heard_keeps_the_azimuth_and_its_deviation_in_the_lane(azimu
     assert np.linalg.eigvalsh(one.covariance).min() >= -1e-9
 
 
-def test_the_likeliest_class_comes_first_and_one_is_always_there():
-    doubted = replace(PLACED.entities[0], classification=PLACED.entities[0].classification[::-1])
-    (one,) = autoware_objects(replace(PLACED, entities=(doubted,)))["objects"]
-    assert [said["label"] for said in one["classification"]] == [1, 0]
-    nothing = replace(PLACED, entities=(replace(doubted, classification=()),))
-    assert autoware_objects(nothing)["objects"][0]["classification"] == [{"label": 0, "probability": 1.0}]
-
-
-def test_labels_and_sizes_are_those_of_the_likeliest_class():
+def test_labels_sizes_and_order_are_those_of_the_likeliest_class():
     (placed,) = autoware_objects(PLACED)["objects"]
     assert placed["classification"] == [{"label": 1, "probability": 0.7}, {"label": 0, "probability": 0.3}]
     assert placed["shape"]["dimensions"]["x"] == 4.5
     speed = placed["kinematics"]["initial_twist_with_covariance"]["twist"]["linear"]["x"]
     assert speed == pytest.approx(4.0)
+    doubted = replace(PLACED.entities[0], classification=PLACED.entities[0].classification[::-1])
+    (one,) = autoware_objects(replace(PLACED, entities=(doubted,)))["objects"]
+    assert [said["label"] for said in one["classification"]] == [1, 0]
+    nothing = replace(PLACED, entities=(replace(doubted, classification=()),))
+    assert autoware_objects(nothing)["objects"][0]["classification"] == [{"label": 0, "probability": 1.0}]
 
 
 class OdasStudio:
@@ -463,32 +418,6 @@ def test_odas_messages_are_whole_however_the_stream_is_cut(vehicles, cuts):
     assert sources == [min(many, 4) for many in vehicles]
 
 
-# Listens at a free port, prints what the window of ODAS Studio would be sent, and ends with the connection.
-STUDIO_PROGRAM = """
-const net = require('net'), listen = net.Server.prototype.listen;
-net.Server.prototype.listen = function (port, then) { return listen.call(this, 0, '127.0.0.1', then); };
-const send = (name, text) => {
-  if (name === 'newTracking') console.log('got ' + JSON.stringify(JSON.parse(text)));
-  if (name === 'remote-offline') process.exit(0);
-};
-const studio = { mainWindow: { webContents: { send } }, odas: {} };
-require(require('path').resolve(process.argv[1], 'servers.js')).startTrackingServer(studio);
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif("ODAS_STUDIO" not in os.environ, reason="ODAS_STUDIO names no checkout of odas_web")
-def test_the_handler_of_odas_studio_gets_every_message_but_the_last(log):
-    command = ["node", "-e", STUDIO_PROGRAM, os.environ["ODAS_STUDIO"]]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as node:
-        port = re.search(r'"port":(\d+)', node.stdout.readline())[1]
-        assert main(["log", "replay", str(log), "--export", f"odas=127.0.0.1:{port}"]) == 0
-        printed, _ = node.communicate(timeout=60.0)
-    got = [json.loads(line[4:]) for line in printed.splitlines() if line.startswith("got ")]
-    # It takes a message when the next begins.
-    assert [one["timeStamp"] for one in got] == [state.seq for state in STATES[:-1]]
-
-
 def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgotten():
     tracks, numbers = OdasTracks(), []
     with_entity = next(state for state in STATES if state.entities)
@@ -499,26 +428,20 @@ def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgo
     assert numbers == list(range(1, 201)) and len(tracks._numbers.of(replace(with_entity, entities=()))) == 0
 
 
-def placed(name, x, y, exists=0.9):
-    return replace(PLACED.entities[0], id=name, position_m=(x, y, 0.0), existence_probability=exists)
-
-
-def mot_text(tmp_path):
-    """Write three states, of which the second has no distance and one number goes on; return the file."""
+def test_mot_text_has_a_row_for_what_has_a_place(tmp_path):
+    """Ten numbers a row; the second of three states has no distance, and one number goes on."""
     only_heard = replace(HIDDEN.entities[0], id="heard")
     lost = replace(only_heard, id="a")
-    first, last = placed("a", 8.0, 4.4), placed("a", 7.0, 4.0)
-    entities = [(first, only_heard), (lost,), (last, placed("b", 9.0, -3.0, 0.25))]
+    first, last, other = (
+        replace(PLACED.entities[0], id=name, position_m=(x, y, 0.0), existence_probability=exists)
+        for name, x, y, exists in (("a", 8.0, 4.4, 0.9), ("a", 7.0, 4.0, 0.9), ("b", 9.0, -3.0, 0.25))
+    )
+    entities = [(first, only_heard), (lost,), (last, other)]
     states = [replace(PLACED, seq=k, entities=each) for k, each in enumerate(entities)]
     (tmp_path / "states.jsonl").write_text("".join(state.to_json() + "\n" for state in states))
     told = f"mot={tmp_path / 'tracks.txt'}"
     assert main(["log", "replay", str(tmp_path / "states.jsonl"), "--export", told]) == 0
-    return tmp_path / "tracks.txt"
-
-
-def test_mot_text_has_a_row_for_what_has_a_place(tmp_path):
-    """Ten numbers a row without a head, indexed by whole frame and id."""
-    table = np.loadtxt(mot_text(tmp_path), delimiter=",", ndmin=2)
+    table = np.loadtxt(tmp_path / "tracks.txt", delimiter=",", ndmin=2)
     assert table.shape == (3, 10)
     frames, ids = table[:, 0], table[:, 1]
     assert (table[:, :2] == np.floor(table[:, :2])).all() and (frames >= 1).all() and (ids >= 1).all()
@@ -527,31 +450,6 @@ def test_mot_text_has_a_row_for_what_has_a_place(tmp_path):
     assert ids[0] == ids[1] != ids[2], "a number stays with its entity"
     found = [[0.9, 8.0, 4.4, 0.0], [0.9, 7.0, 4.0, 0.0], [0.25, 9.0, -3.0, 0.0]]
     assert table[:, 6:].tolist() == found
-
-
-READS_MOT = """
-import json, sys
-from trackeval.datasets import MotChallenge2DBox
-folders = dict(GT_FOLDER="truth", TRACKERS_FOLDER="trackers", SKIP_SPLIT_FOL=True, SEQ_INFO={"street": 3})
-read = MotChallenge2DBox(folders | {"PRINT_CONFIG": False}).get_raw_seq_data("ours", "street")
-told = [read[name] for name in ("tracker_ids", "gt_ids", "tracker_confidences")]
-print(json.dumps([[list(map(float, frame)) for frame in one] for one in told]))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif("TRACKEVAL" not in os.environ, reason="TRACKEVAL names no Python that has TrackEval")
-def test_trackevals_own_reader_takes_the_rows_as_tracks_and_as_truth(tmp_path):
-    rows = mot_text(tmp_path).read_text()
-    for name in ("trackers/ours/data/street.txt", "truth/street/gt/gt.txt"):
-        (tmp_path / name).parent.mkdir(parents=True)
-        (tmp_path / name).write_text(rows)
-    command = [os.environ["TRACKEVAL"], "-c", READS_MOT]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, text=True).stdout
-    ids, truth, confidences = json.loads(said.splitlines()[-1])
-    assert ids == truth and [len(frame) for frame in ids] == [1, 0, 2]
-    assert ids[0][0] in ids[2] and len(set(ids[2])) == 2
-    assert confidences == [[0.9], [], [0.9, 0.25]]
 
 
 def test_missing_packages_and_libraries_raise_an_error(log, tmp_path, monkeypatch, capsys):
