@@ -14,22 +14,23 @@ from worldstate_lab.cli.main import main as study
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.cli.main import main
 
-ARRAY = "x,y,z\n0,0.2,0\n0,0.05,0\n0.05,-0.1,0\n0,-0.25,0\n"
+
+@pytest.fixture
+def command(tmp_path):
+    """Return the words of a quick model of four microphones."""
+    (tmp_path / "mics.csv").write_text("x,y,z\n0,0.2,0\n0,0.05,0\n0.05,-0.1,0\n0,-0.25,0\n")
+    made = ["--array", str(tmp_path / "mics.csv"), "--out", str(tmp_path / "model.json"), "--quick"]
+    return ["model", "make", *made]
 
 
 @pytest.mark.slow
-def test_commissioning_of_four_microphones_resumes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "mics.csv").write_text(ARRAY)
+def test_commissioning_of_four_microphones_resumes(command, tmp_path, capsys):
     out, figure, report = tmp_path / "model.json", tmp_path / "exam.png", tmp_path / "exam.json"
-    command = ["model", "make", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]
     more = ["--figure", str(figure), "--report", str(report), "--mounting-errors"]
     assert main([*command, *more]) == 0
     assert "unfit for use" in capsys.readouterr().out
     model = read_model(out)
-    assert model.sequence is not None and model.sequence.alarm is not None
-    assert model.domain is not None and len(model.domain.positions_m) == 4
+    assert model.sequence.alarm is not None and len(model.domain.positions_m) == 4
     assert not model.provenance.fit_for_use
     assert main(["model", "show", str(out)]) == 0
     card = capsys.readouterr().out
@@ -55,22 +56,16 @@ def test_commissioning_of_four_microphones_resumes(
     assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()} == heard
     assert out.read_bytes() == before
-    boards = [
-        "--array",
-        "respeaker-4",
-        *command[2:4],
-        "--no-exam",
-        "--streams",
-        str(tmp_path / "model.streams"),
-    ]
-    assert main([*command[:2], *boards, "--out", str(tmp_path / "boards"), "--quick"]) == 0
+    boards = ["--array", "respeaker-4", *command[2:4], "--no-exam", "--out", str(tmp_path / "boards")]
+    streams = ["--streams", str(tmp_path / "model.streams"), "--quick"]
+    assert main([*command[:2], *boards, *streams]) == 0
     made = {path.name: path for path in (tmp_path / "boards").iterdir()}
     assert set(made) == {"respeaker-4.json.gz", "mics.json.gz"}
     # The same model except for the card of the omitted exam.
     save_model(out, replace(model, provenance=replace(model.provenance, exam={}, kinds=())))
     assert gzip.decompress(made["mics.json.gz"].read_bytes()) == out.read_bytes() != before
     other = read_model(made["respeaker-4.json.gz"])
-    assert other.domain is not None and other.domain.array == "respeaker-4"
+    assert other.domain.array == "respeaker-4"
     quiet = tmp_path / "night.wav"
     noise = np.random.default_rng(1).standard_normal((6000 * 25, 4)) * 0.01
     soundfile.write(quiet, noise, 6000, subtype="FLOAT")
@@ -78,30 +73,16 @@ def test_commissioning_of_four_microphones_resumes(
     assert "expected 0.10 hours" in capsys.readouterr().err
     assert main([*command, "--no-exam", "--quiet", str(quiet), "--onsets", "600"]) == 0
     told = read_model(out).sequence
-    assert told is not None and told.alarm is not None and told.alarm.onsets_per_hour == 600.0
+    assert told.alarm.onsets_per_hour == 600.0
     # With so little sound no alarm may be reached: the hours are those of the curve.
-    assert told.curve is not None and model.sequence.curve is not None
     assert told.curve.hours == pytest.approx(24.1 / 3600.0) != model.sequence.curve.hours
 
 
 @pytest.mark.slow
-def test_a_moving_ego_has_a_sequence_of_its_own(tmp_path: Path) -> None:
-    (tmp_path / "mics.csv").write_text(ARRAY)
-    out = tmp_path / "model.json"
-    command = [
-        "model",
-        "make",
-        "--array",
-        str(tmp_path / "mics.csv"),
-        "--out",
-        str(out),
-        "--quick",
-        "--no-exam",
-    ]
-    assert main([*command, "--ego", "moving"]) == 0
-    model = read_model(out)
-    assert model.domain is not None and model.domain.ego_motion == "moving"
-    assert model.sequence is not None and model.sequence.alarm is not None
+def test_a_moving_ego_has_a_sequence_of_its_own(command, tmp_path):
+    assert main([*command, "--no-exam", "--ego", "moving"]) == 0
+    model = read_model(tmp_path / "model.json")
+    assert model.domain.ego_motion == "moving"
     assert model.sequence.alarm.onsets_per_hour == 60.0
 
 
@@ -113,9 +94,7 @@ def clips_of(folder: Path, road_user: str) -> list[str]:
     return ["--sounds", str(folder), "--kinds", str(folder / "clips.csv")]
 
 
-def test_wrong_training_data_raises_an_error_before_rendering(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_training_data_raises_an_error_before_rendering(tmp_path, capsys):
     command = ["model", "make", "--quick", "--out", str(tmp_path / "model.json")]
     short = np.random.default_rng(1).uniform(-0.1, 0.1, (12_000, 56))
     soundfile.write(tmp_path / "night.wav", short, 6000)
@@ -131,13 +110,10 @@ def test_wrong_training_data_raises_an_error_before_rendering(
 
 
 @pytest.mark.slow
-def test_a_model_card_lists_recorded_clips(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "mics.csv").write_text(ARRAY)
-    out, options = tmp_path / "model.json", clips_of(tmp_path, "")
-    command = ["model", "make", "--array", str(tmp_path / "mics.csv"), "--out", str(out), "--quick"]
-    assert main([*command, "--no-exam", *options]) == 0
-    model = read_model(out)
-    assert model.guard is not None and "pump" in model.guard.foreign
+def test_a_model_card_lists_recorded_clips(command, tmp_path, capsys):
+    assert main([*command, "--no-exam", *clips_of(tmp_path, "")]) == 0
+    model = read_model(tmp_path / "model.json")
+    assert "pump" in model.guard.foreign
     assert model.road_users is not None and not model.provenance.fit_for_use
     digest = hashlib.sha256((tmp_path / "clips.csv").read_bytes()).hexdigest()
     for told in (model.provenance.classifier, capsys.readouterr().out):

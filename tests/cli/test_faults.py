@@ -20,6 +20,7 @@ from scripted_states import scripted_states
 
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common import progress
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -62,8 +63,8 @@ def files(tmp_path, monkeypatch) -> Path:
     for name in ("a.wav", "m.json", "t.csv", "ids.csv", "mics.xml", "v.mp4", f"{RECORDING}/out_multi.wav"):
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_bytes(b"precious")
-    Path("folder.png").mkdir()
-    Path("folder").mkdir()
+    for name in ("folder.png", "folder", "taken/timeline.png"):
+        Path(name).mkdir(parents=True)
     Path("link.wav").symlink_to("a.wav")
     Path("loop").symlink_to("loop")
     os.mkfifo("pipe")
@@ -100,16 +101,9 @@ def files(tmp_path, monkeypatch) -> Path:
         ("model detector v.mp4 --out v.mp4", "v.mp4"),
         ("model detector v.mp4 --out b.json --figure b.bmp", "b.bmp"),
         ("demo --out a.wav/demo", "a.wav"),
+        ("demo --out taken", "taken/timeline.png: expected a file"),
         ("sim make --out a.wav", "a.wav"),
-    ],
-)
-def test_bad_outputs_raise_an_error_before_the_work(line, named, files, capsys):
-    assert named in refusal(line.split(), files, capsys)
-
-
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
+        # Options without effect
         ("demo --out new --seed -1", "--seed: expected"),
         ("model fit t.csv --seed -1 --out m2.json", "--seed: expected"),
         ("model make --jobs 0 --out m2.json", "--jobs: expected"),
@@ -132,16 +126,13 @@ def test_bad_outputs_raise_an_error_before_the_work(line, named, files, capsys):
         ("live --detector knn --camera-device 0", "--array: expected the positions of the microphones"),
         ("sim make --out new --bandwidth 17000", "bandwidth_hz: expected a number in [700.0, 16000.0]"),
         ("sim make --out new --minutes 1 --bandwidth 17000", "--bandwidth: expected a number in [700.0, 16"),
-        (
-            "run a.wav --images 5",
-            "--images: expected images, a key of COCO results in --detections in its",
-        ),
+        ("run a.wav --images 5", "--images: expected images, a key of COCO results in --detections in its"),
         ("log replay m.json --export mcap=b --export mcap=b", "b: expected another file"),
         ("log replay m.json --export osi=m.json --export osi=b", "m.json: expected another file"),
     ],
 )
-def test_options_without_effect_raise_an_error_before_the_work(line, said, files, capsys):
-    assert said in refusal(line.split(), files, capsys)
+def test_bad_outputs_and_options_without_effect_raise_an_error_before_the_work(line, named, files, capsys):
+    assert named in refusal(line.split(), files, capsys)
 
 
 def test_boxes_need_one_recording(tmp_path, capsys):
@@ -183,29 +174,15 @@ def test_missing_packages_are_named_before_the_work(line, extra, files, capsys, 
     assert "pip install" in refusal(line.split(), files, capsys)
 
 
-@pytest.mark.parametrize("file", ["timeline.png", "states.jsonl"])
-def test_a_folder_named_as_a_figure_raises_an_error_before_the_work(file, tmp_path, capsys):
-    (tmp_path / file).mkdir()
-    assert file in refusal(["demo", "--out", str(tmp_path)], tmp_path, capsys)
-
-
-def test_an_output_through_a_link_keeps_the_link(tmp_path):
-    from worldstate.adapters.files.file_io import write_text
-
+def test_an_output_keeps_the_link_and_the_permissions_of_the_file_that_it_replaces(tmp_path):
     (tmp_path / "real").mkdir()
-    (tmp_path / "link.json").symlink_to("real/model.json")
-    write_text(tmp_path / "link.json", "new")
-    assert (tmp_path / "link.json").is_symlink()
-    assert (tmp_path / "real/model.json").read_text() == "new"
-
-
-def test_an_output_keeps_the_permissions_of_the_file_it_replaces(tmp_path):
-    from worldstate.adapters.files.file_io import write_text
-
-    private = tmp_path / "model.json"
-    write_text(private, "old")
+    link, private = tmp_path / "link.json", tmp_path / "real/model.json"
+    link.symlink_to("real/model.json")
+    write_text(link, "old")
     private.chmod(0o600)
-    write_text(private, "new")
+    write_text(link, "new")
+    assert link.is_symlink()
+    assert private.read_text() == "new"
     assert private.stat().st_mode & 0o777 == 0o600
 
 
@@ -278,17 +255,6 @@ def test_damaged_files_are_read_or_give_one_line(name, whole, tmp_path, capsys):
 # --- disks -----------------------------------------------------------------------------------------------
 
 
-def on_small_disk(words: list[str], limit: int = 4096) -> subprocess.CompletedProcess[str]:
-    """Run a command that may write `limit` bytes per file."""
-    return subprocess.run(
-        [*COMMAND, *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
-    )
-
-
 def one_line(done: subprocess.CompletedProcess[str]) -> str:
     assert done.returncode == 2, done
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
@@ -296,21 +262,28 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
 
 
 @pytest.mark.long
-def test_a_full_disk_leaves_no_recording(tmp_path):
-    done = on_small_disk(["sim", "make", "--out", str(tmp_path), "--static", "1", "--duration", "0.5"])
-    assert "expected to write" in one_line(done)
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-
-
-@pytest.mark.long
-def test_a_full_disk_leaves_no_figure(tmp_path):
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("sim make --out . --static 1 --duration 0.5", "expected to write"),
+        ("array check a.wav --array mics.xml --figure mics.png", "File too large"),
+    ],
+)
+def test_a_full_disk_leaves_no_file(line, said, tmp_path):
+    """A command may write 4096 bytes per file."""
     soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0.0, 0.05, (48_000, 4)), 48_000)
     write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)]))
-    before = tree(tmp_path)
-    sound, figure = str(tmp_path / "a.wav"), str(tmp_path / "mics.png")
-    done = on_small_disk(["array", "check", sound, "--array", str(tmp_path / "mics.xml"), "--figure", figure])
-    assert "File too large" in one_line(done)
-    assert tree(tmp_path) == before
+    limit, before = (4096, 4096), [one for one in tmp_path.rglob("*") if one.is_file()]
+    done = subprocess.run(
+        [*COMMAND, *line.split()],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
+    )
+    assert said in one_line(done)
+    assert [one for one in tmp_path.rglob("*") if one.is_file()] == before
 
 
 def test_a_full_standard_output_gives_one_line():
@@ -432,55 +405,47 @@ def within(seconds: float):
         signal.signal(signal.SIGALRM, before)
 
 
-CAR = "run real.wav --car car.json"
+BARE = "--array mics.csv --uncalibrated"
+PIPES = {
+    f"run pipe {BARE}": None,
+    "run real.wav --uncalibrated --array pipe": None,
+    **{f"run real.wav {BARE} --{name} pipe": None for name in ("model", "detections", "resume", "car")},
+    f"run real.wav {BARE} --camera /dev/zero": None,
+    **dict.fromkeys(("run bag.mcap", "run bag", "log replay bag.mcap", "log replay bag", "explain pipe")),
+    f"run real.wav {BARE} --out o\0.jsonl": None,
+    "array check real.wav --array mics.csv --figure f\0.png": None,
+    "demo --out d\0": None,
+    "live --play real.wav --array mics.csv --allow h\0st": None,
+    f"live --play real.wav {BARE} --key pipe --odometry 127.0.0.1:0": None,
+    "array file": {"array": {"file": "pipe"}},
+    "array name": {"array": {"file": "mics\0.csv"}},
+    "model file": {"array": {"file": "mics.csv"}, "model": "pipe"},
+    "model name": {"array": {"file": "mics.csv"}, "model": "m\0.json"},
+    "odometry file": {"array": {"file": "mics.csv"}, "odometry": "pipe"},
+    "odometry name": {"array": {"file": "mics.csv"}, "odometry": "o\0.csv"},
+}
 
 
-@pytest.mark.parametrize(
-    ("line", "car"),
-    [
-        ("run pipe --array mics.csv", None),
-        ("run real.wav --array pipe", None),
-        ("run real.wav --array mics.csv --model pipe", None),
-        ("run real.wav --array mics.csv --detections pipe", None),
-        ("run real.wav --array mics.csv --camera /dev/zero", None),
-        ("run real.wav --car pipe", None),
-        ("run real.wav --resume pipe --array mics.csv", None),
-        ("run bag.mcap", None),
-        ("run bag", None),
-        ("log replay bag", None),
-        ("explain pipe", None),
-        ("run real.wav --array mics.csv --out o\0.jsonl", None),
-        ("array check real.wav --array mics.csv --figure f\0.png", None),
-        ("demo --out d\0", None),
-        ("live --play real.wav --array mics.csv --allow h\0st", None),
-        ("log replay bag.mcap", None),
-        ("live --play real.wav --array mics.csv --uncalibrated --key pipe --odometry 127.0.0.1:0", None),
-        (CAR, {"array": {"file": "pipe"}}),
-        (CAR, {"array": {"file": "mics\0.csv"}}),
-        (CAR, {"array": {"file": "mics.csv"}, "model": "pipe"}),
-        (CAR, {"array": {"file": "mics.csv"}, "model": "m\0.json"}),
-        (CAR, {"array": {"file": "mics.csv"}, "odometry": "pipe"}),
-        (CAR, {"array": {"file": "mics.csv"}, "odometry": "o\0.csv"}),
-    ],
-)
-def test_pipes_devices_and_nul_names_raise_an_error_at_once(line, car, street, files, capsys):
+@pytest.fixture
+def real(street, files) -> Path:
     shutil.copy(street / "street.wav", "real.wav")
     shutil.copy(street / "mics.csv", "mics.csv")
+    return files
+
+
+@pytest.mark.parametrize("line", PIPES)
+def test_pipes_devices_and_nul_names_raise_an_error_at_once(line, real, capsys):
     os.mkfifo("bag.mcap")
     Path("bag").mkdir()
     os.mkfifo("bag/bag.db3")
     information = {"version": 5, "storage_identifier": "sqlite3", "relative_file_paths": ["bag.db3"]}
     Path("bag/metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": information}))
-    if car is not None:
+    if (car := PIPES[line]) is not None:
         Path("car.json").write_text(json.dumps(car))
+        line = "run real.wav --car car.json --uncalibrated"
     with within(20.0):
-        said = refusal(
-            [*line.split(), *(["--uncalibrated"] if line.startswith("run") else [])], files, capsys
-        )
+        said = refusal(line.split(), real, capsys)
     assert "device or pipe" in said or "null byte" in said
-
-
-LIVE = "live --play real.wav --array mics.csv --uncalibrated"
 
 
 HOSTS = "", "\udcff", "h" * 300, "..", "h" * 64 + ".org"
@@ -488,27 +453,21 @@ PORTS = "9" * 5, "9" * 4000, "9" * 5000, "-1", "x"
 
 
 @pytest.mark.parametrize("option", ["--detections", "--odometry", "--export=odas", "--allow"])
-def test_wrong_addresses_raise_an_error(option, street, files, capsys):
-    shutil.copy(street / "street.wav", "real.wav")
-    shutil.copy(street / "mics.csv", "mics.csv")
-    named = [*((host, "9000") for host in HOSTS), *(("127.0.0.1", port) for port in PORTS)]
-    for host, port in named if option != "--allow" else named[1 : len(HOSTS)]:
-        assert main([*LIVE.split(), f"{option}={host if option == '--allow' else f'{host}:{port}'}"]) == 2
+def test_wrong_addresses_raise_an_error(option, real, capsys):
+    live, port = f"live --play real.wav {BARE}".split(), "" if option == "--allow" else ":9000"
+    given = [f"{host}{port}" for host in (HOSTS[1:] if option == "--allow" else HOSTS)]
+    for one in [*given, *(f"127.0.0.1:{port}" for port in PORTS)] if port else given:
+        assert main([*live, f"{option}={one}"]) == 2
         *notices, last = capsys.readouterr().err.splitlines()
         assert last.startswith("worldstate: ")
         assert notices == [] or option == "--odometry"
 
 
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="names are UTF-8 there")
-def test_a_sound_file_whose_name_is_no_text_is_read(street, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    name = os.fsdecode(b"caf\xe9.wav")
-    shutil.copy(street / "street.wav", name)
-    shutil.copy(street / "mics.csv", "mics.csv")
-    for words in (["run"], ["array", "check"]):
-        assert (
-            main([*words, name, "--array", "mics.csv", *(["--uncalibrated"] if words == ["run"] else [])]) < 2
-        )
+@pytest.mark.parametrize("words", [["run", "--uncalibrated"], ["array", "check"]])
+def test_a_sound_file_whose_name_is_no_text_is_read(words, real, capsys):
+    shutil.copy("real.wav", name := os.fsdecode(b"caf\xe9.wav"))
+    assert main([*words, name, "--array", "mics.csv"]) < 2
     assert "Traceback" not in capsys.readouterr().err
 
 
@@ -542,12 +501,12 @@ def test_no_control_character_reaches_a_terminal(words, files, capsys):
     assert [one for one in printed if not (one.isprintable() or one == "\n")] == []
 
 
+LOGS = """import logging; from worldstate.cli.main import main; main(['--version'])
+logging.getLogger('worldstate').warning('%s', chr(27) + '[2J')"""
+
+
 def test_log_messages_are_escaped_for_a_terminal():
-    script = (
-        "import logging; from worldstate.cli.main import main; main(['--version'])\n"
-        "logging.getLogger('worldstate').warning('%s', chr(27) + '[2J')"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", LOGS], capture_output=True, text=True, check=True)
     assert done.stderr == "\\x1b[2J\n"
 
 

@@ -77,7 +77,7 @@ SILENT: dict[str, tuple[Mapping[str, object], str]] = {
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def street(tmp_path_factory):
     folder = tmp_path_factory.mktemp("street")
     noise = np.random.default_rng(0).uniform(-0.01, 0.01, (round(48_000 * LENGTH_S), 1))
     sound = noise + np.random.default_rng(1).uniform(-0.002, 0.002, (len(noise), 56))
@@ -89,13 +89,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", SILENT)
-def test_an_input_without_effect_gives_a_line(
-    street: Path,
-    name: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_input_without_effect_gives_a_line(street, name, monkeypatch, capsys, caplog):
     monkeypatch.chdir(street)
     given, told = SILENT[name]
     words = ["run", "a.wav"]
@@ -112,23 +106,11 @@ def test_an_input_without_effect_gives_a_line(
     assert code in (0, 2) and told in said, said
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "",
-        "--detections asked.json",
-        "--car asked_car.json",
-        "--odometry steady.csv",
-        "--resume state.json --start 3",
-    ],
-)
-def test_an_input_with_an_effect_gives_no_line(
-    street: Path,
-    words: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+USED = "--detections asked.json", "--car asked_car.json", "--odometry steady.csv"
+
+
+@pytest.mark.parametrize("words", ["", *USED, "--resume state.json --start 3"])
+def test_an_input_with_an_effect_gives_no_line(street, words, monkeypatch, capsys, caplog):
     monkeypatch.chdir(street)
     Path("asked_car.json").write_text(json.dumps({"cameras": [{**FRONT, "detections": "asked.json"}]}))
     Path("steady.csv").write_text(odometry(*np.arange(0.0, LENGTH_S, 0.1)))
