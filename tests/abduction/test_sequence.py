@@ -1,11 +1,15 @@
-"""Inputs of a sequence model are causal and symmetric; its posterior gives times to visible."""
+"""Sequence models: causal and symmetric inputs, times to visible, hop by hop as over a whole stream."""
+
+import json
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_sequence import column, evidence_of
+from made_up_sequence import column, evidence_of, sequence_model
+from scipy.linalg import expm
 
+from worldstate.abduction.sequence.markov_chain import at_prior, balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import INPUTS, MEMORY_HOPS, RECENT_HOPS, sequence_inputs
 from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
@@ -14,7 +18,10 @@ from worldstate.abduction.sequence.sequence_model import (
     SequenceModel,
     SequencePosterior,
 )
+from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
 from worldstate.commissioning.stream_exam import smoothed_log_odds
+from worldstate.ground.serialisation import decode, encode
+from worldstate.ground.values import NotUsable
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -130,3 +137,65 @@ def test_trees_give_the_scores_of_a_walk_from_node_to_node(seed: int, leaves: in
     grown = BoostedTrees(split, threshold, yes, no, value, classes, np.array([0.5, -0.5]))
     np.testing.assert_allclose(grown.scores(X), expected, rtol=1e-12)
     np.testing.assert_array_equal(grown.scores(X[1:2]), grown.scores(X)[1:2])
+
+
+# Shorter and longer than the minute of history that the reader keeps.
+@given(st.integers(0, 2**32 - 1), st.sampled_from([15, 60, 620]))
+@settings(max_examples=4)
+def test_hop_by_hop_gives_the_posterior_of_the_whole_stream(seed: int, hops: int) -> None:
+    rng = np.random.default_rng(seed)
+    model, whole = sequence_model(rng), evidence_of(rng, hops)
+    reader, said = SequenceReader(model), model.posterior(whole).groups
+    for number, hop in enumerate(whole):
+        reading = reader.read(hop[None])
+        if number < 9:
+            assert isinstance(reading, NotUsable)
+        else:
+            assert isinstance(reading, SequenceReading)
+            np.testing.assert_array_equal(reading.groups, said[number])
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=3)
+def test_a_reader_continues_bit_for_bit_from_a_saved_history(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model, hops = sequence_model(rng), evidence_of(rng, 40)
+    reader = SequenceReader(model)
+    cut = int(rng.integers(0, 30))
+    for hop in hops[:cut]:
+        reader.read(hop[None])
+    written = json.dumps(encode(reader.history), allow_nan=False)
+    again = SequenceReader(model, decode(SequenceHistory, json.loads(written), "history"))
+    for hop in hops[cut:]:
+        here, there = reader.read(hop[None]), again.read(hop[None])
+        if isinstance(here, SequenceReading):
+            np.testing.assert_array_equal(here.groups, there.groups)
+    assert isinstance(here, SequenceReading)
+
+
+@given(SEEDS, st.integers(1, 10**9), st.integers(1, 10**9))
+def test_a_balanced_chain_keeps_its_distribution_and_two_steps_are_one(seed: int, one: int, two: int) -> None:
+    rng = np.random.default_rng(seed)
+    chain, share = rng.dirichlet(np.ones(5), 5), 0.9 * rng.dirichlet(np.ones(5)) + 0.02
+    rates_hz = balanced(0.9 * chain + 0.02, share) - np.eye(5)
+    first, second, both = (transitions(rates_hz, step_ns) for step_ns in (one, two, one + two))
+    np.testing.assert_allclose(first @ second, both, atol=1e-9)
+    np.testing.assert_allclose(share @ both, share, atol=1e-7)
+    np.testing.assert_allclose(np.eye(5)[0] @ transitions(rates_hz, 10**12), share, atol=1e-4)
+
+
+@given(SEEDS, st.integers(1, 22), st.floats(-4.0, 2.0), st.integers(1, 10**10))
+def test_a_step_is_the_matrix_exponential_of_its_rates(
+    seed: int, states: int, scale: float, step_ns: int
+) -> None:
+    rates_hz = np.random.default_rng(seed).exponential(10.0**scale, (states, states))
+    np.fill_diagonal(rates_hz, 0.0)
+    np.fill_diagonal(rates_hz, -rates_hz.sum(axis=1))
+    np.testing.assert_allclose(transitions(rates_hz, step_ns), expm(rates_hz * (step_ns / 1e9)), atol=1e-11)
+
+
+@given(SEEDS)
+def test_a_change_of_prior_is_reversible(seed: int) -> None:
+    share, prior, said = 0.9 * np.random.default_rng(seed).dirichlet(np.ones(5), 3) + 0.02
+    there = at_prior(said, share, prior)
+    np.testing.assert_allclose(at_prior(there, prior, share), said / said.sum(), atol=1e-12)

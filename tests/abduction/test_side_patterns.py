@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up_sequence import evidence_of, sequence_model
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
+from worldstate.abduction.sequence.sequence_reader import SequenceReader
 from worldstate.abduction.sequence.street_sides import (
     SECTORS,
     PassSound,
@@ -138,22 +140,27 @@ def test_hand_overs_teach_the_side_and_checkpoints_continue_exactly():
 
 
 def test_patterns_are_not_applied_for_three_seconds_after_a_pass():
-    rng = np.random.default_rng(5)
-    sound = {
-        arm: PassSound(
-            sign * np.linspace(1.0, -1.0, SECTORS) + rng.normal(0.0, 0.3, (30, SECTORS)), np.ones(30), "roof"
-        )
-        for arm, sign in (("left", 1.0), ("right", -1.0))
-    }
-    known = SidePatterns("roof")
-    for arm, one in sound.items():
-        known = known.with_pass(arm, one)
+    known = learned(passes_of(np.random.default_rng(5), 1))
     listener, left = StreetListener(StreetHearing(known)), np.exp(np.linspace(1.0, -1.0, 60))
     even = np.full((2, len(GROUPS)), 1.0 / len(GROUPS))
     assert (listener.turned(even, left) != even).any()
     listener.passed("right")
     turned = [bool((listener.turned(even, left) != even).any()) for _ in range(31)]
     assert turned == [hop >= 29 for hop in range(31)]
+
+
+def test_a_known_street_corrects_the_sides_of_a_reading() -> None:
+    rng = np.random.default_rng(5)
+    model, hops = sequence_model(rng), evidence_of(rng, 12)
+    known, of_the_left = learned(passes_of(rng, 1)), np.arange(60, 0, -1.0)
+    plain, corrected = (
+        SequenceReader(model),
+        SequenceReader(model, street=StreetListener(StreetHearing(known))),
+    )
+    for hop in hops:
+        usual, told = plain.read(hop[None]), corrected.read(hop[None], of_the_left)
+    np.testing.assert_array_equal(told.groups, known.sides().turned(usual.groups[None], of_the_left[None])[0])
+    assert not np.array_equal(told.groups, usual.groups)
 
 
 def test_overlapping_passes_of_both_arms_teach_nothing():

@@ -1,19 +1,19 @@
 """The ensemble for unseen junctions: mirror law, site references, optimal coefficients."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import log_softmax
+from worldstate_lab.features.feature_evaluation import predict_held_out
 
 from worldstate.abduction.signature.ensemble import (
     KINDS,
     expert_views,
     log_levels,
     mirror_features,
-    shape_features,
     site_reference,
 )
 from worldstate.abduction.signature.ensemble_training import (
@@ -30,7 +30,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.operations.training.site_references import learned_while_listening, with_site_references
-from worldstate.operations.training.training import fit_ensemble
+from worldstate.operations.training.training import TrainingSettings, fit_ensemble, train_model
 
 
 def windows(rng, n=200, spread=0.8):
@@ -110,13 +110,7 @@ def test_an_excluded_site_has_no_simulated_windows():
     X, y = windows(rng)
     groups, everywhere = np.tile(["SA1", "SA2"], 100), simulated(rng, ["SA1", "SA2", "SB1"])
     chosen = np.isin(everywhere.sites, ["SA1", "SA2"])
-    here = SimulatedWindows(
-        everywhere.X[chosen],
-        everywhere.y[chosen],
-        everywhere.sites[chosen],
-        everywhere.weights[chosen],
-        everywhere.other_side[chosen],
-    )
+    here = SimulatedWindows(*(getattr(everywhere, column.name)[chosen] for column in fields(everywhere)))
     with_all, with_some, without = (
         SiteEnsembleClassifier(simulated=some).fit(X, y, groups).model_ for some in (everywhere, here, None)
     )
@@ -145,15 +139,11 @@ def test_training_adds_windows_with_the_estimated_reference():
 
 
 def test_level_views_have_larger_weights_for_a_moving_ego():
-    labels, _, recordings, features = made_up_junctions()
-    models = {}
+    (labels, _, recordings, features), norms = made_up_junctions(), {}
     for kind in ("S", "D"):
         sites = [f"{kind}A{i % 2}" for i in range(len(labels))]
-        models[kind] = fit_ensemble(with_site_references(table(labels, sites, recordings, features)))
-    norms = {
-        kind: {one.view: np.linalg.norm(one.weights) for one in model.experts}
-        for kind, model in models.items()
-    }
+        model = fit_ensemble(with_site_references(table(labels, sites, recordings, features)))
+        norms[kind] = {one.view: np.linalg.norm(one.weights) for one in model.experts}
     for recipe in RECIPES:
         ratio = norms["D"][recipe.view] / norms["S"][recipe.view]
         assert ratio > 1.05 if recipe.view in KINDS else ratio == pytest.approx(1.0)
@@ -180,13 +170,8 @@ def test_a_share_of_a_simulated_hazard_is_labelled_with_the_other_side(other_sid
     left = np.tile(np.hstack([np.full(60, 50.0), np.zeros(180)]), (n, 1))
     rest = np.tile(np.hstack([np.full(60, 1.0), np.zeros(180)]), (2, 1))
     labels = np.concatenate([np.repeat("left", n), ["front", "none"]])
-    more = SimulatedWindows(
-        np.concatenate([left, rest]),
-        labels,
-        np.repeat("SA1", n + 2),
-        np.full(n + 2, 1.0),
-        np.full(n + 2, other_side),
-    )
+    at, shares = np.repeat("SA1", n + 2), (np.full(n + 2, 1.0), np.full(n + 2, other_side))
+    more = SimulatedWindows(np.concatenate([left, rest]), labels, at, *shares)
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
     assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.5, 0.5], abs=0.02)
     # This pattern is symmetric, so both sides are equally likely. An asymmetric one shows the share.
@@ -221,17 +206,6 @@ def test_the_coefficients_are_the_optimum_of_the_penalised_likelihood(trained):
         for _ in range(20):
             step = rng.normal(size=expert.weights.shape) * 0.01
             assert loss(expert.weights + step) > best
-
-
-def test_shape_features_of_a_mirrored_window_are_mirrored():
-    levels = np.random.default_rng(4).normal(size=(50, 60))
-    ours, theirs = shape_features(levels), shape_features(mirror_features(levels))
-    for segment in (0, 13):
-        np.testing.assert_allclose(ours[:, segment + 4], theirs[:, segment + 6])
-        signed = [segment + 7, segment + 8]
-        np.testing.assert_allclose(ours[:, signed], -theirs[:, signed])
-    rest = [c for c in range(31) if c % 13 not in (4, 6, 7, 8) or c >= 26]
-    np.testing.assert_allclose(ours[:, rest], theirs[:, rest], atol=1e-12)
 
 
 def table(labels, environments, recordings, features):
@@ -270,16 +244,12 @@ def made_up_junctions():
 @settings(max_examples=8)
 @given(st.integers(0, 44), st.sampled_from(["none", "left", "right"]))
 def test_a_learned_reference_excludes_the_scored_recording(recording, label):
-    labels, sites, recordings, features = made_up_junctions()
-    before = learned_while_listening(
-        table(labels, sites, recordings, features), np.random.default_rng(recording)
-    )
+    labels, _, recordings, features = made = made_up_junctions()
+    before = learned_while_listening(table(*made), np.random.default_rng(recording))
     mine = [row for row, name in enumerate(recordings) if name == str(recording)]
     for row in mine:
         labels[row], features[row] = label, 3.0
-    after = learned_while_listening(
-        table(labels, sites, recordings, features), np.random.default_rng(recording)
-    )
+    after = learned_while_listening(table(*made), np.random.default_rng(recording))
     for row in mine:
         np.testing.assert_array_equal(before[row].level, after[row].level)
 
@@ -295,11 +265,11 @@ def test_learning_needs_hazard_free_windows_or_starts_empty():
 
 
 def test_a_stream_is_ten_windows_of_mostly_empty_street():
-    labels, sites, recordings, features = made_up_junctions()
+    labels, _, _, features = made = made_up_junctions()
     features[:] = np.where(np.array(labels) == "left", np.e, 1.0)[:, None]
     # NaN would show if windows of a visible car entered the stream.
     features[np.array(labels) == "front"] = np.nan
-    learned = learned_while_listening(table(labels, sites, recordings, features), np.random.default_rng(0))
+    learned = learned_while_listening(table(*made), np.random.default_rng(0))
     assert learned[0].heard_s == pytest.approx(10.0, rel=0.05)
     assert np.mean([one.level.mean() for one in learned]) == pytest.approx(0.05, abs=0.03)
 
@@ -307,12 +277,6 @@ def test_a_stream_is_ten_windows_of_mostly_empty_street():
 def test_a_site_with_one_recording_has_no_reference():
     with pytest.raises(InvalidArgumentError, match="SA1/0"):
         with_site_references(table(["none"] * 2, ["SA1"] * 2, ["0", "0"], np.ones((2, 60))))
-
-
-def test_quiet_is_the_mean_of_the_quietest_third():
-    levels = np.arange(20.0)[:, None] + np.zeros((20, 2))
-    reference = site_reference(levels)
-    np.testing.assert_allclose(reference, np.repeat([9.5, 9.5, levels[:7, 0].mean()], 2))
 
 
 def test_training_is_deterministic(trained):
@@ -323,3 +287,29 @@ def test_training_is_deterministic(trained):
 def test_likelihoods_are_finite_far_from_the_training_data(trained):
     for level in (0.0, 1e-30, 1.0, 1e30):
         assert np.isfinite(trained[2].evidence(np.full(60, level)).log_likelihoods).all()
+
+
+def made_up_table(seed):
+    """Return features of 60 recordings at three sites; a step of three is a louder site."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.tile(np.linspace(-1, 1, 30), 2)
+    shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
+    labels = [
+        (n, one)
+        for n in range(60)
+        for one in (("none",) if n % 2 else (("left", "right")[n // 6 % 2], "front"))
+    ]
+    levels = [shape[one] + 0.7 * rng.normal(size=60) + 0.3 * (n % 3) for n, one in labels]
+    sites, recordings = ([f"SA{n % 3}" for n, _ in labels], [f"{seed} {n}" for n, _ in labels])
+    return table([one for _, one in labels], sites, recordings, np.exp(levels))
+
+
+def test_a_trained_model_predicts_other_recordings_and_holds_no_row_of_its_data():
+    known, other = made_up_table(0), made_up_table(2)
+    model = train_model(known, TrainingSettings(repeats=1), dataset="made up", group="static")
+    assert model.policies.for_alpha(0.02).reference_prior == model.signature.reference_prior
+    predictions = predict_held_out(model, other, 0.05, "run", np.random.default_rng(0))[0.0]
+    assert (predictions.classes == other.labels).mean() > 0.8
+    rows = {value.tobytes() for value in np.log(known.features).ravel()}
+    written = [model.signature.home, *(expert.weights for expert in model.signature.experts)]
+    assert not rows & {value.tobytes() for one in written for value in one.ravel()}

@@ -1,14 +1,58 @@
-"""Isotonic regression on a grid against a general quadratic solver and scikit-learn in one dimension."""
+"""Miss rates over azimuth and degradation: the table, and the isotonic regression that makes one."""
+
+import json
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import LinearConstraint, minimize
 from sklearn.isotonic import IsotonicRegression
 
-from worldstate.abduction.co_evidence import isotonic_grid
+from worldstate.abduction.co_evidence import MissRateTable, isotonic_grid
+from worldstate.ground.serialisation import decode, encode
+
+
+def floats(n, low, high):
+    return st.lists(st.floats(low, high), min_size=n, max_size=n)
+
+
+@st.composite
+def tables(draw):
+    n_azimuths, n_levels = draw(st.integers(2, 5)), draw(st.integers(2, 5))
+    azimuths = np.cumsum(draw(floats(n_azimuths - 1, 1, 20)))
+    steps = np.cumsum(draw(floats(n_levels - 1, 0.05, 0.2)))
+    rises = np.array(draw(floats(n_azimuths * n_levels, 0, 1)))
+    beta = np.cumsum(np.cumsum(rises.reshape(n_azimuths, n_levels), 0), 1)
+    beta /= max(1.0, beta[-1, -1])
+    rows = tuple(map(tuple, beta.tolist()))
+    return MissRateTable((0.0, *azimuths.tolist()), (0.0, *steps.tolist()), rows, {"car": rows})
+
+
+@given(tables(), st.floats(-1.5, 1.5), st.floats(0, 1))
+def test_the_table_is_bilinear_inside_its_range_and_one_outside(table, azimuth_rad, level):
+    magnitude = abs(np.degrees(azimuth_rad))
+    value = table(azimuth_rad, level)
+    if magnitude > table.azimuth_deg[-1] or level > table.degradation[-1]:
+        assert value == 1.0
+    else:
+        oracle = RegularGridInterpolator((table.azimuth_deg, table.degradation), np.array(table.beta))
+        assert value == pytest.approx(float(oracle([[magnitude, level]])[0]), abs=1e-9)
+    assert table(azimuth_rad, level, "car") == value
+
+
+@given(tables())
+def test_reads_back_what_it_wrote(table):
+    assert decode(MissRateTable, json.loads(json.dumps(encode(table))), "file") == table
+
+
+def test_a_class_may_have_rows_of_its_own():
+    table = MissRateTable((0, 30), (0, 1), ((0.0, 1.0), (0.2, 1.0)), {"bicycle": ((0.5, 1.0), (0.5, 1.0))})
+    assert table(0.0, 0.0, "bicycle") == 0.5
+    assert table(0.0, 0.0, "car") == 0.0
+
 
 shapes = st.tuples(st.integers(1, 5), st.integers(1, 5))
 grids = shapes.flatmap(
@@ -56,12 +100,3 @@ def test_the_grid_is_monotone_and_optimal(grid):
 def test_a_single_row_is_isotonic_regression(values):
     expected = IsotonicRegression().fit_transform(np.arange(values.size), values)
     assert isotonic_grid(values[None], np.ones((1, values.size)))[0] == pytest.approx(expected, abs=1e-7)
-
-
-@given(grids)
-@settings(deadline=None)
-def test_an_ordered_grid_and_the_weighted_mean_are_unchanged(grid):
-    values, weights = grid
-    found = isotonic_grid(values, weights)
-    assert isotonic_grid(found, weights) == pytest.approx(found, abs=1e-8)
-    assert np.average(found, weights=weights) == pytest.approx(np.average(values, weights=weights), abs=1e-5)
