@@ -25,7 +25,6 @@ from worldstate.operations.training.site_references import STREAMS
 from worldstate.operations.training.training import (
     N_FOLDS,
     calibrate_passes,
-    calibrate_windows,
     fit_ensemble,
     folds_by_recording,
     recording_labels,
@@ -150,10 +149,9 @@ def test_a_threshold_is_the_mean_over_streams_and_half_way_between_both_folds():
     paid = int(0.1 * table.hazard_free.sum())
     expected = np.mean([np.mean([one[paid] for one in level]) for level in sorted_scores])
     assert learned.gamma == pytest.approx(expected, abs=1e-12)
-    pooled = np.concatenate(levels[1])
-    flags = np.tile(table.hazards, 3), np.tile(table.hazard_free, 3)
-    alone = calibrate_windows(pooled, *flags, alpha=0.1, miss_rate=0.0, fit_map=fit_platt)
-    assert learned.risk_map == alone.risk_map
+    scored, pooled = np.tile(table.hazards | table.hazard_free, 3), np.concatenate(levels[1])
+    hazards = np.tile(table.hazards, 3)[scored]
+    assert learned.risk_map == fit_platt(hazard_statistic(pooled, 0.0)[scored], hazards)
     with pytest.raises(InvalidArgumentError, match="pass"):
         calibrate_passes(table, [[], levels[1]], alpha=0.1, miss_rate=0.0)
 

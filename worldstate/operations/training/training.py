@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
-from worldstate.abduction.cueing.risk_map import RiskMap, fit_isotonic, fit_platt
+from worldstate.abduction.cueing.risk_map import RiskMap, fit_platt
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import (
@@ -60,40 +60,6 @@ class WindowCalibration:
         return score, self.risk_map(score), score >= self.gamma
 
 
-def calibrate_windows(
-    probabilities: FloatArray,
-    hazards: BoolArray,
-    hazard_free: BoolArray,
-    *,
-    alpha: float,
-    miss_rate: float,
-    fit_map: FitMap = fit_isotonic,
-) -> WindowCalibration:
-    """Set threshold and risk map on posteriors of windows outside the training set of the classifier.
-
-    Shapes: probabilities (n, 4), hazards, hazard_free (n,).
-
-    Examples
-    --------
-    >>> posteriors = np.array([[0.1, 0.7, 0.1, 0.1], [0.1, 0.1, 0.7, 0.1], [0.0, 0.1, 0.8, 0.1]])
-    >>> hazards = np.array([True, False, False])
-    >>> calibration = calibrate_windows(posteriors, hazards, ~hazards, alpha=0.5, miss_rate=1.0)
-    >>> calibration.apply(posteriors)[2]
-    array([ True, False, False])
-    """
-    # The threshold is set for single windows. A sustained rule raises an alarm for only some of them, so it
-    # also meets the budget.
-    if not hazards.any() or not hazard_free.any():
-        raise InvalidArgumentError("calibration: expected windows with and without a hazard")
-    score = hazard_statistic(probabilities, miss_rate)
-    scored = hazards | hazard_free
-    return WindowCalibration(
-        miss_rate=miss_rate,
-        gamma=_gamma(score[hazard_free], alpha),
-        risk_map=fit_map(score[scored], hazards[scored]),
-    )
-
-
 def calibrate_passes(
     table: FeatureTable,
     levels: Sequence[Sequence[FloatArray]],
@@ -114,19 +80,18 @@ def calibrate_passes(
     # threshold of a level is the mean over its passes, because the choice of a street's ten windows changes
     # the few scores that determine gamma. The risk map is that of the boldest level: statistics of windows
     # that are compared with their site have the same meaning at other sites, which is not true of a
-    # classifier from too few junctions.
+    # classifier from too few junctions. The threshold is set for single windows. A sustained rule raises an
+    # alarm for only some of them, so it also meets the budget.
     if not levels or not all(levels):
         raise InvalidArgumentError("levels: expected at least one pass each")
-    gammas = [
-        np.mean([_gamma(hazard_statistic(one, miss_rate)[table.hazard_free], alpha) for one in passes])
-        for passes in levels
-    ]
-    boldest = levels[-1]
-    hazards, hazard_free = (np.tile(flags, len(boldest)) for flags in (table.hazards, table.hazard_free))
-    learned = calibrate_windows(
-        np.concatenate(boldest), hazards, hazard_free, alpha=alpha, miss_rate=miss_rate, fit_map=fit_map
-    )
-    return replace(learned, gamma=float(np.mean(gammas)))
+    if not table.hazards.any() or not table.hazard_free.any():
+        raise InvalidArgumentError("calibration: expected windows with and without a hazard")
+    scores = [[hazard_statistic(one, miss_rate) for one in passes] for passes in levels]
+    gammas = [np.mean([_gamma(one[table.hazard_free], alpha) for one in passes]) for passes in scores]
+    scored = table.hazards | table.hazard_free
+    score = np.concatenate([one[scored] for one in scores[-1]])
+    risk_map = fit_map(score, np.tile(table.hazards[scored], len(scores[-1])))
+    return WindowCalibration(miss_rate, float(np.mean(gammas)), risk_map)
 
 
 def _gamma(score: FloatArray, alpha: float) -> float:
