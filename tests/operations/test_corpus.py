@@ -346,7 +346,7 @@ def test_approaches_and_onsets_equal_those_of_explain_and_run(raised):
         meter.update(state)
         warnings.update(state)
     told, _ = told_advisories(states)
-    found = {(one.side, nanoseconds(one.time_s), nanoseconds(one.end_s)) for one in meter.approaches()}
+    found = {(one.side, nanoseconds(one.time_s), nanoseconds(one.end_s)) for one in meter.approaches}
     assert found == {(one.direction, one.since_ns, one.last_ns) for one in told}
     assert meter.recording("").onsets == len(warnings.summary().advisory_onsets_s)
     assert sum(row.hops for row in meter.hours()) == len(states)
@@ -356,7 +356,7 @@ def test_an_unannounced_vehicle_is_an_approach():
     *_, in_view, _ = scripted_states()
     meter = ApproachMeter("a", "")
     meter.update(replace(in_view, cues=()))
-    (missed,) = meter.approaches()
+    (missed,) = meter.approaches
     assert (missed.side, missed.time_s, missed.seen, missed.lead_s) == ("left", None, True, None)
 
 
@@ -413,7 +413,7 @@ def test_the_recall_of_a_cascade_is_measured_on_whole_recordings(quiet, options,
     kept = np.zeros(21, np.bool_)
     kept[16] = True
     meter.cascaded(kept, sampled=True)
-    assert [(round(one.time_s, 1), one.kept) for one in meter.approaches()] == [(5.1, False), (15.1, True)]
+    assert [(round(one.time_s, 1), one.kept) for one in meter.approaches] == [(5.1, False), (15.1, True)]
     with pytest.raises(InvalidArgumentError, match="cascade: expected it without hops"):
         hear(quiet, tmp_path, cascade=True, hops=True, **options)
 

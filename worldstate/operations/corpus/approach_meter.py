@@ -26,7 +26,7 @@ class ApproachMeter:
     --------
     >>> meter = ApproachMeter("a.wav", "elm street")
     >>> meter.update(WorldState(stamp_ns=1_000_000_000, seq=1))
-    >>> meter.recording("").hops, [one.unheard for one in meter.hours()], meter.approaches()
+    >>> meter.recording("").hops, [one.unheard for one in meter.hours()], meter.approaches
     (1, [None], [])
     """
 
@@ -40,7 +40,7 @@ class ApproachMeter:
     _raised: bool = False
     _hops: Counter[tuple[str, str | None]] = field(default_factory=Counter)
     _onsets: Counter[tuple[str, str | None]] = field(default_factory=Counter)
-    _rows: list[HeardApproach] = field(default_factory=list)
+    approaches: list[HeardApproach] = field(default_factory=list)  # In the order of their starts
     _standing: dict[str | None, int] = field(default_factory=dict)  # Rows of active advisories, by side
     _in_view: dict[str, int] = field(default_factory=dict)  # Rows of vehicles that came into view
 
@@ -65,43 +65,43 @@ class ApproachMeter:
     def _advise(self, state: WorldState, raised: list[RiskCue], looked: bool) -> None:
         now_s, before, self._standing = state.time_s, self._standing, {}
         for cue in raised:
-            at = before.get(cue.direction, len(self._rows))
-            if at == len(self._rows):
+            at = before.get(cue.direction, len(self.approaches))
+            if at == len(self.approaches):
                 expected_s = None if cue.time_to_visible_s is None else cue.time_to_visible_s[1]
                 begun = HeardApproach(self.name, self.site, cue.direction, now_s, chance=cue.risk)
-                self._rows.append(replace(begun, expected_s=expected_s, usable=cue.usable))
-            self._standing[cue.direction], row = at, self._rows[at]
-            self._rows[at] = replace(row, end_s=now_s, seen=False if looked and not row.seen else row.seen)
+                self.approaches.append(replace(begun, expected_s=expected_s, usable=cue.usable))
+            self._standing[cue.direction], row = at, self.approaches[at]
+            self.approaches[at] = replace(row, end_s=now_s, seen=bool(row.seen) if looked else row.seen)
 
     def _see(self, entity: Entity, now_s: float) -> None:
         if (at := self._in_view.get(entity.id)) is None:
             at = self._in_view[entity.id] = self._announced(entity.direction, now_s)
-            began_s = self._rows[at].time_s
+            began_s = self.approaches[at].time_s
             lead_s = None if began_s is None else now_s - began_s
-            self._rows[at] = replace(self._rows[at], seen=True, seen_s=now_s, lead_s=lead_s)
+            self.approaches[at] = replace(self.approaches[at], seen=True, seen_s=now_s, lead_s=lead_s)
         likeliest = max(entity.classification or (), key=lambda one: one.probability, default=None)
-        label = self._rows[at].label if likeliest is None else likeliest.label
-        self._rows[at] = replace(self._rows[at], gone_s=now_s, label=label)
+        label = self.approaches[at].label if likeliest is None else likeliest.label
+        self.approaches[at] = replace(self.approaches[at], gone_s=now_s, label=label)
 
     def _announced(self, side: str | None, now_s: float) -> int:
         """Return the row of the advisory that announced a vehicle from this side, or a new row."""
-        for at, one in reversed([*enumerate(self._rows)]):
+        for at, one in reversed([*enumerate(self.approaches)]):
             if one.side == side and one.seen_s is None and one.end_s is not None:
                 if now_s - one.end_s <= _HORIZON_S:
                     return at
                 break
-        self._rows.append(HeardApproach(self.name, self.site, side))
-        return len(self._rows) - 1
+        self.approaches.append(HeardApproach(self.name, self.site, side))
+        return len(self.approaches) - 1
 
     def cascaded(self, kept: BoolArray, sampled: bool) -> None:
         """Count the skipped hops of a cascade; if all were processed, mark the approaches that it keeps."""
         if not sampled:
             self._hops["", LEFT_OUT] += round(float((~kept).sum()) / HOP_S)
             return
-        for at, row in enumerate(self._rows):
+        for at, row in enumerate(self.approaches):
             if row.time_s is not None:
                 second = min(int(row.time_s - seconds(self.first_ns or 0) + 1.0), len(kept) - 1)
-                self._rows[at] = replace(row, kept=bool(kept[second]))
+                self.approaches[at] = replace(row, kept=bool(kept[second]))
 
     def recording(self, content: str) -> HeardRecording:
         """Return the row of the recording."""
@@ -109,10 +109,6 @@ class ApproachMeter:
         heard = sum(hops for (_, unheard), hops in self._hops.items() if unheard is None)
         counts = self._hops.total(), heard, self.looked, self.usable, self._onsets.total()
         return HeardRecording(self.name, self.site, content, first_s, last_s, *counts, self.budget)
-
-    def approaches(self) -> list[HeardApproach]:
-        """Return the approaches in the order of their starts."""
-        return self._rows
 
     def hours(self) -> list[StateHours]:
         """Return the hops by state of the sensors."""

@@ -256,7 +256,7 @@ def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
             meter.update(step.state)
         if kept is not None:
             meter.cascaded(kept, sampled)
-    write_rows(plan.file("approaches", shard), HeardApproach, meter.approaches())
+    write_rows(plan.file("approaches", shard), HeardApproach, meter.approaches)
     write_rows(plan.file("hours", shard), StateHours, meter.hours())
     return meter.recording(content)
 
