@@ -102,7 +102,7 @@ def test_an_exam_excludes_its_own_sounds() -> None:
 
 @pytest.mark.slow
 def test_simulated_sounds_exceed_the_ambience() -> None:
-    rows = sound_rows(ovad_array(), "SB1", 6000.0, np.random.default_rng(1))
+    rows = sound_rows(ovad_array(), 6000.0, ("SB1", np.random.default_rng(1)))
     assert set(rows.kinds.tolist()) <= {*FOREIGN, *SIGNALS}
     assert {"voice", "music", "siren"} <= set(rows.kinds.tolist())
     # Speech is modulated at 2.8 to 6.2 Hz in all bands at once, a steady tone hardly.

@@ -105,19 +105,13 @@ def fit_softmax(
     return slopes, fitted.intercept_ - slopes @ mean
 
 
-def sound_rows(
-    array: MicrophoneArray, site_name: str, sample_rate_hz: float, rng: np.random.Generator
-) -> SoundRows:
+def sound_rows(array: MicrophoneArray, rate_hz: float, drawn: tuple[str, np.random.Generator]) -> SoundRows:
     """Render a sound of every kind at a site, at the middle microphone; return its audible hops."""
-    settings = StreamSettings(junction_named(site_name), minutes=1.0, sample_rate_hz=sample_rate_hz)
-    position = standing_m(array)[array.middle]
-    kinds = (*FOREIGN, *SIGNALS)
-    return SoundRows.joined(
-        [
-            _rows_of_sound(settings, kind, position, draws)
-            for kind, draws in zip(kinds, rng.spawn(len(kinds)), strict=True)
-        ]
-    )
+    site_name, rng = drawn
+    settings = StreamSettings(junction_named(site_name), minutes=1.0, sample_rate_hz=rate_hz)
+    kinds, position = (*FOREIGN, *SIGNALS), standing_m(array)[array.middle]
+    draws = zip(kinds, rng.spawn(len(kinds)), strict=True)
+    return SoundRows.joined([_rows_of_sound(settings, kind, position, own) for kind, own in draws])
 
 
 def street_rows(stream: HeardStream) -> SoundRows:
@@ -270,13 +264,8 @@ def guard_rows(
     rate_hz = float(streets[0].hops.middle.shape[1] * HOPS_A_SECOND)
     sites = sorted({stream.site for stream in streets})[:_SITES_OF_SOUNDS] * sounds_each
     draws = list(zip(sites, rng.spawn(len(sites)), strict=True))
-    heard = in_processes(partial(_sounds_at, array, rate_hz), draws, jobs)
+    heard = in_processes(partial(sound_rows, array, rate_hz), draws, jobs)
     return SoundRows.joined([*map(street_rows, streets), *heard])
-
-
-def _sounds_at(array: MicrophoneArray, rate_hz: float, drawn: tuple[str, np.random.Generator]) -> SoundRows:
-    name, rng = drawn
-    return sound_rows(array, name, rate_hz, rng)
 
 
 def train_guard(
@@ -289,8 +278,7 @@ def train_guard(
     """Train a guard on processed streams of at least two sites, and on sounds."""
     rows = SoundRows.joined([guard_rows(array, streets, rng, jobs=jobs), of_guard(close)])
     excesses = street_excesses(rows)
-    found = [excesses[label][~np.isnan(excesses[label])] for label in OF_STREETS]
-    return fit_guard(rows, max(threshold_of(found), CC0_THRESHOLD))
+    return fit_guard(rows, max(threshold_of([excesses[label] for label in OF_STREETS]), CC0_THRESHOLD))
 
 
 def of_guard(close: SoundRows) -> SoundRows:
@@ -326,21 +314,13 @@ def fit_guard(rows: SoundRows, threshold: float = 0.0) -> DomainGuard:
     others = {kind: kind for kind in np.unique(rows.kinds).tolist() if kind not in names}
     foreign, signals = (_named(rows, kinds) for kinds in (FOREIGN | others, SIGNALS))
     names |= others
-    kept = ~np.isin(rows.kinds, (*OF_STREETS, "")) | (np.arange(len(rows.kinds)) % _EVERY == 0)
+    rows = rows.select(~np.isin(rows.kinds, (*OF_STREETS, "")) | (np.arange(len(rows.kinds)) % _EVERY == 0))
     order = ["street", *foreign, *signals]
-    kinds = rows.kinds[kept]
-    labels = np.array([order.index(names[kind]) for kind in kinds.tolist()])
-    weights = _weights(kinds, labels, len(foreign), len(signals))
-    slopes, biases = fit_softmax(rows.measures[kept], labels, weights, weights * len(labels))
-    return DomainGuard(
-        measures=MEASURES,
-        foreign=foreign,
-        signals=signals,
-        weights=significant(slopes, _FIGURES),
-        biases=significant(biases, _FIGURES),
-        threshold=threshold,
-        signal_nats=SIGNAL_NATS,
-    )
+    labels = np.array([order.index(names[kind]) for kind in rows.kinds.tolist()])
+    weights = _weights(rows.kinds, labels, len(foreign), len(signals))
+    slopes, biases = fit_softmax(rows.measures, labels, weights, weights * len(labels))
+    slopes, biases = (significant(one, _FIGURES) for one in (slopes, biases))
+    return DomainGuard(MEASURES, foreign, signals, slopes, biases, threshold, SIGNAL_NATS)
 
 
 def _named(rows: SoundRows, names: dict[str, str]) -> tuple[str, ...]:

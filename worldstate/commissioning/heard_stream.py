@@ -5,7 +5,7 @@ The sound itself is not stored: an hour of 56 channels at 6 kHz takes 5 GB, the 
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
 from math import ceil
 from pathlib import Path
@@ -219,7 +219,6 @@ def mountings(array: MicrophoneArray, rng: np.random.Generator) -> dict[str, Mic
     }
 
 
-HOPS, VEHICLES, ROWS = "hops", "vehicles", "rows"
 ROW_S = 0.1
 _PCM = 32767.0
 
@@ -264,13 +263,12 @@ class HeardStream:
 
     def save(self, path: Path) -> None:
         """Write the stream, completely or not at all."""
-        save_named(path, {HOPS: self.hops, VEHICLES: self.vehicles, ROWS: self.rows})
+        save_named(path, {one.name: getattr(self, one.name) for one in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> "HeardStream":
         """Read a stream that `save` wrote."""
-        tables = load_named(path, "a processed stream")
-        return cls(tables[HOPS], tables[VEHICLES], tables[ROWS])
+        return cls(**load_named(path, "a processed stream"))
 
 
 def hear_stream(
@@ -331,17 +329,17 @@ def _heard_hops(
     name: str,
     about: Mapping[str, object],
 ) -> list[HopTable]:
-    chosen = listening_settings(sample_rate_hz)
-    front_ends = [FrontEnd(array, sample_rate_hz, chosen) for _, array in ears]
-    frames: list[list[AcousticFrame]] = [[] for _ in ears]
-    middles: list[list[Float32Array]] = [[] for _ in ears]
+    # Simulated microphones do not fail, and their monitoring takes a third of the time.
+    all_evidence = FrontEndSettings.heard_at(
+        sample_rate_hz, level_band_hz=LEVEL_BAND_HZ, watch_channels=False
+    )
+    front_ends = [FrontEnd(array, sample_rate_hz, all_evidence) for _, array in ears]
+    frames, middles = [list[AcousticFrame]() for _ in ears], [list[Float32Array]() for _ in ears]
     for samples in blocks:
-        for heard, middle, front_end, (channels, array) in zip(
-            frames, middles, front_ends, ears, strict=True
-        ):
+        for number, (channels, array) in enumerate(ears):
             own = samples[:, channels]
-            middle.append(own[:, array.middle].copy())
-            heard += front_end.process(own)
+            middles[number].append(own[:, array.middle].copy())
+            frames[number] += front_ends[number].process(own)
     for heard, front_end in zip(frames, front_ends, strict=True):
         heard += front_end.finish()
     if not frames[0]:
@@ -350,12 +348,6 @@ def _heard_hops(
         HopTable(_columns(heard, np.concatenate(middle)), name=name, about=about)
         for heard, middle in zip(frames, middles, strict=True)
     ]
-
-
-def listening_settings(sample_rate_hz: float) -> FrontEndSettings:
-    """Return the front-end settings for streams: all evidence, without monitoring of microphones."""
-    # Simulated microphones do not fail, and their monitoring takes a third of the time.
-    return FrontEndSettings.heard_at(sample_rate_hz, level_band_hz=LEVEL_BAND_HZ, watch_channels=False)
 
 
 def _columns(frames: list[AcousticFrame], middle: Float32Array) -> dict[str, np.ndarray]:
