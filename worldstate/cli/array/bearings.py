@@ -35,14 +35,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
-    from worldstate.adapters.files.file_io import write_text
     from worldstate.operations.recordings import bearing_track
 
     output.check_outputs(arguments, "out", figures=("figure",))
     with inputs.opened_front_end(arguments) as (audio, front_end), progress.sound_bar(audio) as bar:
         track = bearing_track.track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
         silent = list(audio.silent_channels)
-    write_text(arguments.out, bearing_track.bearings_csv(track))
+    bearing_track.write_bearings(track, arguments.out)
     if arguments.figure is not None:
         bearing_track.write_bearings_figure(track, arguments.figure, audio.path.name)
     if (at_edge := float(track.at_edge.mean())) > _MUCH_AT_EDGE and arguments.azimuth_span is not None:

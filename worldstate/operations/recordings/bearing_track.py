@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.adapters.audio.sound_file import Audio
+from worldstate.adapters.files.file_io import write_rows
 from worldstate.frontend.direction.music import count_sources
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -27,18 +28,10 @@ _FORMS = {"time_s": ".3f", "azimuth_deg": ".2f", "std_deg": ".2f", "prominence":
 _FORMS |= {"sources": ".0f"}
 
 
-def bearings_csv(track: HopTable) -> str:
-    """Return the table as CSV text.
-
-    Examples
-    --------
-    >>> columns = {"time_s": 1.0, "azimuth_deg": 20.0, "std_deg": 3.4, "prominence": 2.0}
-    >>> print(bearings_csv(HopTable({name: np.array([one]) for name, one in columns.items()})), end="")
-    time_s,azimuth_deg,std_deg,prominence
-    1.000,20.00,3.40,2.000
-    """
+def write_bearings(track: HopTable, path: Path) -> None:
+    """Write the table as CSV, atomically."""
     columns = [[f"{value:{_FORMS[name]}}" for value in column] for name, column in track.columns.items()]
-    return "\n".join([",".join(track.columns), *map(",".join, zip(*columns, strict=True)), ""])
+    write_rows(path, tuple(track.columns), zip(*columns, strict=True), newline="\n")
 
 
 def track_bearings(

@@ -1,9 +1,10 @@
 """Report of the microphone faults of a recording: table, text and figure."""
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from worldstate.adapters.audio.sound_file import Audio
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, Dropout, Fault
+from worldstate.frontend.health.channel_health import MASKED_FAULTS, ArrayHealth, ChannelFault, Dropout, Fault
 from worldstate.frontend.health.common_sound import ARRAY_FAULTS, NOTHING_IN_COMMON, OUT_OF_PLACE
 from worldstate.frontend.health.position_check import NOTHING_AGAINST, PositionVerdict
 from worldstate.frontend.stream import AcousticFrame
@@ -179,7 +180,8 @@ class HealthLog:
     def __init__(self) -> None:
         self._n_hops = 0
         self._unheard: Counter[str | None] = Counter()
-        self._seen: dict[tuple[int, Fault], ChannelVerdict] = {}
+        # Number of hops of each fault of a channel, the end of the first one, and the latest report
+        self._seen: dict[tuple[int, Fault], tuple[int, float, ChannelFault]] = {}
         self._dropouts: list[Dropout] = []
         self._latest: ArrayHealth | None = None
 
@@ -196,10 +198,8 @@ class HealthLog:
         self._latest = health
         for fault in health.faults:
             key = fault.channel, fault.fault
-            before = self._seen.get(key) or ChannelVerdict(*key, 0.0, seconds(frame.stamp_ns), fault.value)
-            # The shares are numbers of hops, which the summary divides.
-            newest: dict[str, Any] = {"value": fault.value, "looks_like": fault.looks_like, "std": fault.std}
-            self._seen[key] = replace(before, share=1.0 + before.share, **newest)
+            hops, first_s, _ = self._seen.get(key, (0, seconds(frame.stamp_ns), fault))
+            self._seen[key] = hops + 1, first_s, fault
 
     def summary(self) -> RecordingHealth:
         """Return the verdicts so far."""
@@ -210,32 +210,34 @@ class HealthLog:
         return RecordingHealth(self._verdicts(), dropouts, count, self._n_hops, coherence, unheard=unheard)
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
-        ordered = sorted(self._seen.values(), key=lambda verdict: (verdict.channel, verdict.fault))
         explained = {(channel, other) for channel, fault in self._seen for other in _EXPLAINS.get(fault, ())}
-        own = (verdict for verdict in ordered if (verdict.channel, verdict.fault) not in explained)
-        kept = [verdict for verdict in own if not self._is_other_half(verdict)]
-        return tuple(replace(verdict, share=verdict.share / self._n_hops) for verdict in _one_cause(kept))
+        verdicts = [
+            ChannelVerdict(*key, hops / self._n_hops, first_s, last.value, last.looks_like, last.std)
+            for key, (hops, first_s, last) in sorted(self._seen.items(), key=lambda item: item[0])
+            if key not in explained and not self._is_other_half(*key)
+        ]
+        return _one_cause(verdicts)
 
-    def _is_other_half(self, verdict: ChannelVerdict) -> bool:
+    def _is_other_half(self, channel: int, fault: Fault) -> bool:
         """Return whether the channel has the other fault, dead or intermittent, in more hops."""
         others = {Fault.DEAD: Fault.INTERMITTENT, Fault.INTERMITTENT: Fault.DEAD}
-        other = self._seen.get((verdict.channel, others.get(verdict.fault, verdict.fault)))
-        return other is not None and other.fault != verdict.fault and other.share > verdict.share
+        other = self._seen.get((channel, others.get(fault, fault)))
+        return other is not None and other[0] > self._seen[channel, fault][0]
 
 
-def _one_cause(verdicts: list[ChannelVerdict]) -> list[ChannelVerdict]:
+def _one_cause(verdicts: list[ChannelVerdict]) -> tuple[ChannelVerdict, ...]:
     """Keep, of misplaced channels, those with the main fault and at least half of its share of hops."""
     misplaced = [verdict for verdict in verdicts if verdict.fault in _MISPLACED]
     if any(verdict.fault is Fault.DRIFT for verdict in misplaced):
         # A drift begins as a delay.
         misplaced = [verdict for verdict in misplaced if verdict.fault is not Fault.DELAY]
     cause = max(misplaced, key=lambda verdict: verdict.share, default=None)
-    return [
+    return tuple(
         verdict
         for verdict in verdicts
         if verdict.fault not in _MISPLACED
         or (cause and verdict.fault is cause.fault and 2.0 * verdict.share >= cause.share)
-    ]
+    )
 
 
 def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Path) -> None:
@@ -244,9 +246,9 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
     place = array.centred_m[:, [across, up]]
     with style.figure_file(path, 7.5, 6.0) as figure:
         axes = figure.add_subplot()
-        for points, area, label in ((place, _AREA, None), (place[:0], _LEGEND_AREA, "well")):
-            x, y = points.T
-            axes.scatter(x, y, s=area, color="white", edgecolors="0.6", lw=0.8, label=label)
+        well: dict[str, Any] = {"color": "white", "edgecolors": "0.6", "lw": 0.8}
+        axes.scatter(*place.T, s=_AREA, **well)
+        axes.scatter([], [], s=_LEGEND_AREA, label="well", **well)
         drawn: Counter[int] = Counter()
         for fault in sorted({verdict.fault for verdict in health.verdicts}):
             channels = [verdict.channel for verdict in health.verdicts if verdict.fault == fault]
@@ -272,7 +274,8 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
 
 def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stance: str) -> dict[str, object]:
     """Return the report as values for JSON; channels are counted from 1, and unknown values are None."""
-    rate = health.sample_rate
+    rate, positions = health.sample_rate, health.positions
+    order = None if positions.order is None else [place + 1 for place in positions.order]
     return {
         "path": str(audio.path),
         "healthy": health.is_healthy,
@@ -285,7 +288,7 @@ def as_json(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stanc
         "masked_microphones": [channel + 1 for channel in health.masked_channels],
         "condition": "working" if health.is_healthy else "impaired",
         "unheard": health.unheard,
-        "positions": _positions_json(health.positions),
+        "positions": encode(positions) | {"fit": positions.fits, "order": order},
         "faults": [_fault_json(verdict) for verdict in health.verdicts],
         "n_dropouts": health.n_dropouts,
         "dropouts": [encode(one) for one in health.dropouts],
@@ -299,16 +302,10 @@ def _fault_json(verdict: ChannelVerdict) -> dict[str, object]:
     return encode(verdict) | {"channel": verdict.channel + 1, "looks_like": other, "masked": verdict.masked}
 
 
-def _positions_json(positions: PositionVerdict) -> dict[str, object]:
-    order = positions.order if positions.order is None else [place + 1 for place in positions.order]
-    return encode(positions) | {"fit": positions.fits, "order": order}
-
-
 def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stance: str) -> Iterator[str]:
     """Yield the lines of the report."""
-    alias = array.alias_hz()
     yield f"{audio.path}: {audio.channels} channels, {audio.sample_rate_hz} Hz, {audio.duration_s:.1f} s"
-    yield f"array: {stance}, alias-free to {alias:.0f} Hz"
+    yield f"array: {stance}, alias-free to {array.alias_hz():.0f} Hz"
     if health.verdicts:
         yield ""
         yield from _table(health.verdicts)
@@ -320,24 +317,17 @@ def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stanc
 
 def _table(verdicts: tuple[ChannelVerdict, ...]) -> Iterator[str]:
     yield f"{'channel':>7}  {'fault':<12}  {'since':>6}  {'hops':>5}  what and what to do"
-    for card in _cards(verdicts):
-        first, last, verdict = card[0].channel + 1, card[-1].channel + 1, card[0]
-        channels = str(first) if first == last else f"{first}-{last}"
-        when = f"{verdict.first_s:5.1f}s  {100 * verdict.share:4.0f}%"
-        yield f"{channels:>7}  {verdict.fault.value:<12}  {when}  {_advice(verdict)}"
+    for _, card in itertools.groupby(enumerate(verdicts), _card):
+        each = [verdict for _, verdict in card]
+        channels = "-".join(str(one.channel + 1) for one in (each[0], *each[1:][-1:]))
+        when = f"{each[0].first_s:5.1f}s  {100 * each[0].share:4.0f}%"
+        yield f"{channels:>7}  {each[0].fault.value:<12}  {when}  {_advice(each[0])}"
 
 
-def _cards(verdicts: tuple[ChannelVerdict, ...]) -> list[list[ChannelVerdict]]:
-    """Group consecutive channels with equal delay or drift, because they share a sound card."""
-    cards: list[list[ChannelVerdict]] = []
-    for verdict in verdicts:
-        last = cards[-1][-1] if cards else None
-        same = last and verdict.std is not None and (last.fault, last.value) == (verdict.fault, verdict.value)
-        if same and last and last.channel + 1 == verdict.channel:
-            cards[-1].append(verdict)
-        else:
-            cards.append([verdict])
-    return cards
+def _card(numbered: tuple[int, ChannelVerdict]) -> object:
+    """Return what verdicts of one sound card have in common: consecutive channels, equal delay or drift."""
+    number, verdict = numbered
+    return number if verdict.std is None else (verdict.channel - number, verdict.fault, verdict.value)
 
 
 def _advice(verdict: ChannelVerdict) -> str:
