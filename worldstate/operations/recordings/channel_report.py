@@ -247,7 +247,7 @@ def write_array_figure(array: MicrophoneArray, health: RecordingHealth, path: Pa
     with style.figure_file(path, 7.5, 6.0) as figure:
         axes = figure.add_subplot()
         well: dict[str, Any] = {"color": "white", "edgecolors": "0.6", "lw": 0.8}
-        axes.scatter(*place.T, s=_AREA, **well)
+        axes.scatter(place[:, 0], place[:, 1], s=_AREA, **well)
         axes.scatter([], [], s=_LEGEND_AREA, label="well", **well)
         drawn: Counter[int] = Counter()
         for fault in sorted({verdict.fault for verdict in health.verdicts}):
