@@ -1,10 +1,14 @@
-"""Lead time and hand-over of a stream of states."""
+"""Onsets, lead time and hand-over of a stream of states."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.ground.values import nanoseconds
+from worldstate.operations.metrics.approach_table import onset_outcome, rising_edges
+from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.recording_report import WarningMeter, announcement
 from worldstate.state import Advisory, Context, Entity, RiskCue, WorldState
 from worldstate.state.context import Priors
@@ -29,31 +33,20 @@ def summary(t0_s: float | None, onsets: dict[float, str], *entities: Entity, haz
 
 def test_lead_time_counts_from_the_first_onset_within_five_seconds():
     got = summary(8.0, {1.0: "early", 5.5: "heard", 7.0: "again"})
-    assert got.lead_time_s == 2.5
-    assert got.first_advisory_s == 5.5
-    assert got.false_advisories_before == 1
-    assert got.advisories_after_t0 == 0
-    assert got.hidden_entity_id == "again"
+    assert (got.lead_time_s, got.first_advisory_s, got.hidden_entity_id) == (2.5, 5.5, "again")
+    assert (got.false_advisories_before, got.advisories_after_t0) == (1, 0)
 
 
 def test_an_advisory_after_line_of_sight_has_no_lead_time():
     got = summary(4.0, {6.0: "late"})
-    assert got.lead_time_s is None
-    assert got.first_advisory_s == 6.0
-    assert got.advisories_after_t0 == 1
+    assert (got.lead_time_s, got.first_advisory_s, got.advisories_after_t0) == (None, 6.0, 1)
 
 
-def test_every_onset_of_a_hazard_free_recording_is_false():
-    got = summary(None, {2.0: "a", 5.0: "b"}, hazard_free=True)
-    assert got.lead_time_s is None
-    assert got.false_advisories_before == 2
-    assert got.advisories_after_t0 is None
-
-
-def test_onsets_of_unlabelled_recordings_are_not_called_false():
-    got = summary(None, {2.0: "a", 5.0: "b"})
-    assert got.false_advisories_before is None
-    assert got.advisory_onsets_s == (2.0, 5.0)
+@pytest.mark.parametrize(("hazard_free", "false"), [(True, 2), (False, None)])
+def test_only_onsets_of_a_hazard_free_recording_are_false(hazard_free, false):
+    got = summary(None, {2.0: "a", 5.0: "b"}, hazard_free=hazard_free)
+    assert (got.lead_time_s, got.advisories_after_t0) == (None, None)
+    assert (got.false_advisories_before, got.advisory_onsets_s) == (false, (2.0, 5.0))
 
 
 def test_parked_cars_are_not_handed_over():
@@ -98,3 +91,18 @@ def test_the_announcement_states_the_lead_time_of_each_vehicle(onsets_s, truth, 
     hops = [hop / 10 for hop in range(100)]
     states = [state(time_s, any(at <= time_s < at + 0.3 for at in onsets_s)) for time_s in hops]
     assert announcement(states, truth, "a van") == told
+
+
+@given(st.lists(st.booleans(), max_size=50))
+def test_every_onset_is_a_change_from_quiet_to_alarm(alarm):
+    by_hand = [t for t, on in enumerate(alarm) if on and (t == 0 or not alarm[t - 1])]
+    assert rising_edges(alarm).tolist() == by_hand
+
+
+def test_an_onset_at_line_of_sight_is_no_warning():
+    # At 47,998 Hz the hop of T0 = 7 s ends at sample 335,986, 6.3 us before T0.
+    at_t0_s = round(7.0 * 47_998) / 47_998 - 6.3e-6
+    assert not onset_outcome([at_t0_s], 7.0).detected
+    assert onset_outcome([at_t0_s - 0.1], 7.0).detected
+    table = HopTable({"time_s": np.array([7.0 + 9e-6, 7.1])}, label="left", t0_s=7.0)
+    assert table.before_sight().tolist() == [True, False]
