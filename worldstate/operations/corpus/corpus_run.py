@@ -21,12 +21,7 @@ from worldstate.adapters.source import Source, SourceParts, SourceSensors, open_
 from worldstate.adapters.state_log import PARQUET, is_own_mcap, read_log
 from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground import (
-    InputFileError,
-    InvalidArgumentError,
-    MissingExtraError,
-    WorldstateError,
-)
+from worldstate.ground import InputFileError, InvalidArgumentError, MissingExtraError, WorldstateError
 from worldstate.ground.extras import check_extra
 from worldstate.ground.parallel import in_executor, in_processes
 from worldstate.ground.version import __version__
