@@ -192,7 +192,16 @@ def calibrate_cueing(
     if not free:
         raise InvalidArgumentError("recordings: expected at least one without a hazard")
     approaches = [stream for stream in streams if stream.before_sight().any()]
-    budgets, policies = _by_miss_rate(free, approaches, reference_prior, kept, chosen)
+    budgets, policies = list[BudgetReport](), list[CueingPolicy]()
+    for beta in sorted(MISS_RATES):
+        calm = [statistic_at(stream, reference_prior, beta) for stream in free]
+        hazards = [statistic_at(one, reference_prior, beta)[one.before_sight()] for one in approaches]
+        nearest = min(kept.policies, key=lambda policy: abs(policy.miss_rate - beta))
+        risk = _risk_map(calm, hazards) if hazards else nearest.risk_map
+        for alpha in chosen.alphas:
+            gamma, held_out = chosen.threshold(calm, alpha), _held_out(calm, alpha, chosen)
+            budgets.append(BudgetReport(alpha, beta, gamma, _counted(calm, gamma, chosen), *held_out))
+            policies.append(CueingPolicy(gamma, chosen.sustain_hops, alpha, reference_prior, risk, beta))
     tau = correlation_time_hops([statistic_at(stream, reference_prior, 0.0) for stream in free])
     fitted = "isotonic" if isinstance(policies[0].risk_map, IsotonicMap) else "platt"
     return CueingCalibration(
@@ -205,26 +214,6 @@ def calibrate_cueing(
         risk=fitted if approaches else "kept",
         warnings=tuple(_warnings(budgets, len(free))),
     )
-
-
-def _by_miss_rate(
-    free: Sequence[HopTable],
-    approaches: Sequence[HopTable],
-    prior: tuple[float, ...],
-    kept: CueingPolicies,
-    settings: CueingSettings,
-) -> tuple[list[BudgetReport], list[CueingPolicy]]:
-    budgets, policies = list[BudgetReport](), list[CueingPolicy]()
-    for beta in sorted(MISS_RATES):
-        calm = [statistic_at(stream, prior, beta) for stream in free]
-        hazards = [statistic_at(one, prior, beta)[one.before_sight()] for one in approaches]
-        nearest = min(kept.policies, key=lambda policy: abs(policy.miss_rate - beta))
-        risk = _risk_map(calm, hazards) if hazards else nearest.risk_map
-        for alpha in settings.alphas:
-            gamma, held_out = settings.threshold(calm, alpha), _held_out(calm, alpha, settings)
-            budgets.append(BudgetReport(alpha, beta, gamma, _counted(calm, gamma, settings), *held_out))
-            policies.append(CueingPolicy(gamma, settings.sustain_hops, alpha, prior, risk, beta))
-    return budgets, policies
 
 
 def statistic_at(stream: HopTable, prior: Sequence[float], miss_rate: float) -> FloatArray:
