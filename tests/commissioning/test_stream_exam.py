@@ -253,13 +253,14 @@ def test_curves_have_the_share_warned_by_a_time() -> None:
     np.testing.assert_allclose(auroc_before(streams, before_s), [1.0, 1.0, 0.75, 0.5], atol=0.01)
 
 
-def levels(seed: int, junctions: int, streams: int = 2) -> dict[str, list[FloatArray]]:
+def levels(seed: int, junctions: int, streams: int = 2) -> list[tuple[str, FloatArray]]:
     """Return hazard-free streams of half a minute at junctions, some louder or denied."""
-    rng, found = np.random.default_rng(seed), dict[str, list[FloatArray]]()
+    rng, found = np.random.default_rng(seed), list[tuple[str, FloatArray]]()
     for junction in range(junctions):
         louder = rng.normal(0.0, 2.0)
         wander = rng.normal(0.0, 0.5, (streams, 300)).cumsum(axis=1) + louder
-        found[f"J{junction}"] = list(np.where(rng.random((streams, 300)) < 0.1, -np.inf, wander))
+        denied = np.where(rng.random((streams, 300)) < 0.1, -np.inf, wander)
+        found += [(f"J{junction}", one) for one in denied]
     return found
 
 
@@ -284,8 +285,7 @@ CURVES = settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
 def test_the_points_of_a_curve_are_counts_and_no_rate_falls(seed: int, junctions: int) -> None:
     quiet = levels(seed, junctions)
-    streams = [one for there in quiet.values() for one in there]
-    curve = measured_curve(quiet)
+    streams, curve = [one for _, one in quiet], measured_curve(quiet)
     direct = np.array([counted(streams, one) for one in curve.threshold_nats.tolist()])
     # Alarms that merge are one onset, so the maximum so far counts.
     assert curve.onsets_per_hour == pytest.approx(np.maximum.accumulate(direct[:, 0]))
@@ -300,8 +300,7 @@ def test_the_points_of_a_curve_are_counts_and_no_rate_falls(seed: int, junctions
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_the_alarm_is_the_lowest_threshold_within_the_budget(seed: int, budget: float, share: float) -> None:
     quiet = levels(seed, 4)
-    streams = [one for there in quiet.values() for one in there]
-    curve = measured_curve(quiet)
+    streams, curve = [one for _, one in quiet], measured_curve(quiet)
     least, most = 3.0 / curve.hours, float(curve.onsets_per_hour[-1])
     assume(most > least)
     asked = least + budget * (most - least)
@@ -328,13 +327,14 @@ def test_the_alarm_is_the_lowest_threshold_within_the_budget(seed: int, budget: 
 def test_budgets_for_other_junctions_hold_on_left_out_ones(seed: int, junctions: int, rate: float) -> None:
     # For any streams, over all ways to leave one out, as for exchangeable junctions.
     quiet, rates = levels(seed, junctions), list[float]()
-    for name in quiet:
-        others = {other: streams for other, streams in quiet.items() if other != name}
+    there = {name: [levels for junction, levels in quiet if junction == name] for name, _ in quiet}
+    for name in there:
+        others = [one for one in quiet if one[0] != name]
         alarm = measured_curve(others, elsewhere=True).default(rate)
-        rates.append(min(counted(quiet[name], alarm.threshold_nats)[0], LOUDEST * rate))
+        rates.append(min(counted(there[name], alarm.threshold_nats)[0], LOUDEST * rate))
     assert np.mean(rates) <= rate * (1.0 + 1e-9)
     curve = measured_curve(quiet, elsewhere=True)
-    losses = [[counted(one, level)[0] for level in curve.threshold_nats.tolist()] for one in quiet.values()]
+    losses = [[counted(one, level)[0] for level in curve.threshold_nats.tolist()] for one in there.values()]
     assert (np.maximum(curve.onsets_low, curve.onsets_per_hour) <= curve.onsets_high).all()
     # Another implementation of the same bound. Merged alarms are one, so the maximum so far counts.
     worst = np.maximum.accumulate(np.minimum(losses, LOUDEST * rate), axis=1) / (LOUDEST * rate)
@@ -405,8 +405,7 @@ def test_inconsistent_curves_raise_an_error() -> None:
 
 def test_two_quiet_junctions_give_a_threshold_without_alarms() -> None:
     quiet = levels(7, 2)
-    curve = measured_curve(quiet, elsewhere=True)
-    streams = [one for there in quiet.values() for one in there]
+    curve, streams = measured_curve(quiet, elsewhere=True), [one for _, one in quiet]
     assert curve.onsets_per_hour.max() == 0.0
     assert counted(streams, curve.default(20.0).threshold_nats) == (0.0, 0.0)
 
@@ -425,7 +424,7 @@ def test_the_interval_of_a_curve_has_its_stated_coverage() -> None:
             np.where(rng.random(n) < p, rng.exponential(1.0, n), -50.0)
             for n, p in zip(hops, often.tolist(), strict=True)
         ]
-        curve = measured_curve({str(j): [row] for j, row in enumerate(streams[:12])})
+        curve = measured_curve((str(j), row) for j, row in enumerate(streams[:12]))
         at = int(np.sum(curve.threshold_nats > 0.0)) - 1
         rate, _ = counted(streams[12:], float(curve.threshold_nats[at]))
         inside.append(bool(curve.onsets_low[at] <= rate <= curve.onsets_high[at]))

@@ -11,7 +11,8 @@ onsets, whose exact interval is used.
 Source: J. Hilbe, "Negative binomial regression", 2011.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -168,7 +169,7 @@ def raised_at(levels: FloatArray, threshold_nats: float) -> BoolArray:
     return np.asarray(((at - last <= HELD_HOPS) & (denied < last)).any(axis=1))
 
 
-def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool = False) -> AlarmCurve:
+def measured_curve(quiet: Iterable[tuple[str, FloatArray]], *, elsewhere: bool = False) -> AlarmCurve:
     r"""Count onsets and hops in alarm on hazard-free streams, at decreasing thresholds.
 
     With `elsewhere`, the rate of a point is the smallest budget b that is expected to hold at another
@@ -181,8 +182,8 @@ def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool
 
     Parameters
     ----------
-    quiet : mapping of str to sequences of arrays, each of shape (hops, sides)
-        `alarm_levels` of the streams of each junction; shape (hops,) for a single level.
+    quiet : iterable of (str, ndarray of shape (hops, sides))
+        Junction and `alarm_levels` of every stream; shape (hops,) for a single level.
     elsewhere : bool
         Whether the rate is for another junction.
 
@@ -191,10 +192,13 @@ def measured_curve(quiet: Mapping[str, Sequence[FloatArray]], *, elsewhere: bool
     InvalidArgumentError
         If there is no stream, or with `elsewhere` if there are fewer than two junctions.
     """
-    streams = [one for there in quiet.values() for one in there]
-    if not streams or (elsewhere and len(quiet) < LOUDEST - 1.0):
-        raise InvalidArgumentError(f"quiet: expected at least {LOUDEST - 1:g} junctions, got {len(quiet)}")
-    first = np.cumsum([0, *map(len, list(quiet.values())[:-1])])
+    there = defaultdict[str, list[FloatArray]](list)
+    for junction, levels in quiet:
+        there[junction].append(levels)
+    if not there or (elsewhere and len(there) < LOUDEST - 1.0):
+        raise InvalidArgumentError(f"quiet: expected at least {LOUDEST - 1:g} junctions, got {len(there)}")
+    streams = [one for some in there.values() for one in some]
+    first = np.cumsum([0, *map(len, list(there.values())[:-1])])
     thresholds = _thresholds(np.concatenate(streams))
     raised = [[raised_at(one, level) for level in thresholds.tolist()] for one in streams]
     onsets = np.add.reduceat([[rising_edges(on).size for on in stream] for stream in raised], first)

@@ -147,17 +147,11 @@ def _path(array: MicrophoneArray, believed: MicrophoneArray, folder: Path, setti
 
 def stream_evidence(model: EnsembleModel, heard: HeardStream) -> FloatArray:
     """Return the evidence along a stream, from a window model and the front-end."""
-    hops, posteriors = heard.hops, posteriors_along(model, heard.hops.feature)
-    return hop_columns(
-        side_ratios(posteriors, model.classes, model.class_prior),
-        visible_ratios(posteriors, model.class_prior),
-        feature=hops.feature,
-        band_log_energy=hops.band_log_energy,
-        prominence=hops.prominence,
-        looming_hz=hops.looming_hz,
-        looming_std_hz=hops.looming_std_hz,
-        bearing_rad=hops.bearing_rad,
-    )
+    posteriors = posteriors_along(model, heard.hops.feature)
+    sides = side_ratios(posteriors, model.classes, model.class_prior)
+    names = "feature", "band_log_energy", "prominence", "looming_hz", "looming_std_hz", "bearing_rad"
+    own = {name: heard.hops.columns[name] for name in names}
+    return hop_columns(sides, visible_ratios(posteriors, model.class_prior), **own)
 
 
 def learn_sequence(
@@ -194,11 +188,9 @@ def learn_sequence(
         silent = replace(one, alarm=UNREACHED)
         calm += [(streams[i], windows, silent, evidence[i]) for i in outside if streams[i].hazard_free]
         on_step("trees")
-    quiet = dict[str, list[FloatArray]]()
-    for (heard, *_), levels in zip(calm, in_processes(_quiet_levels, calm, jobs), strict=True):
-        quiet.setdefault(heard.site, []).append(levels)
-    on_step("alarm")
+    quiet = zip([heard.site for heard, *_ in calm], in_processes(_quiet_levels, calm, jobs), strict=True)
     curve, margin_s = measured_curve(quiet, elsewhere=True), float(np.mean(margins))
+    on_step("alarm")
     every = [labelled[i] for outside in folds for i in outside]
     final = train_sequence(every, int(rng.integers(2**31)), sizes)
     return replace(final, margin_s=margin_s, alarm=curve.default(onsets_per_hour), curve=curve)
@@ -308,10 +300,8 @@ def commission(
     made = replace(model, provenance=origin, sequence=sequence)
     if not calm:
         return made
-    quiet_levels = dict[str, list[FloatArray]]()
-    for one in calm:
-        quiet_levels.setdefault(one.site, []).append(levels_of(made, one))
-    return with_curve(made, measured_curve(quiet_levels), settings.onsets_per_hour)
+    curve = measured_curve((one.site, levels_of(made, one)) for one in calm)
+    return with_curve(made, curve, settings.onsets_per_hour)
 
 
 def real_figures(array: MicrophoneArray, *, moving_ego: bool = False) -> tuple[RealFigure, ...]:
@@ -445,15 +435,8 @@ def table_and_beside(
     own = np.isin(learned.y, CLASSES)
     n_features = learned.X.shape[1] // (1 + len(KINDS))
     numbers = np.arange(len(own)).astype(np.str_)[own]
-    table = FeatureTable(
-        learned.X[own, :n_features],
-        learned.y[own],
-        numbers,
-        learned.sites[own],
-        numbers,
-        (None,) * len(numbers),
-        domain,
-    )
+    columns = learned.X[own, :n_features], learned.y[own], numbers, learned.sites[own], numbers
+    table = FeatureTable(*columns, (None,) * len(numbers), domain)
     return table, SimulatedWindows(*(getattr(learned, one.name)[~own] for one in fields(SimulatedWindows)))
 
 

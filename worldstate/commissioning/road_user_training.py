@@ -123,15 +123,9 @@ def _pass(
     ratio = (_over_a_second(loudness(part, rate)) for part in (sound, ambience))
     audible = np.divide(*ratio) >= 10.0 ** (_AUDIBLE_DB / 10.0)
     time_s = (np.arange(len(usable)) + 1) / HOPS_A_SECOND - _LEAD_S - seen_s
-    learned = time_s[usable] <= LAST_S
-    rows = RoadUserRows(
-        measures,
-        np.full(len(measures), kind),
-        np.full(len(measures), site.name),
-        audible[usable],
-        time_s[usable] >= FIRST_S,
-    )
-    return rows.select(learned)
+    named = np.full(len(measures), kind), np.full(len(measures), site.name)
+    rows = RoadUserRows(measures, *named, audible[usable], time_s[usable] >= FIRST_S)
+    return rows.select(time_s[usable] <= LAST_S)
 
 
 def _over_a_second(power: FloatArray) -> FloatArray:

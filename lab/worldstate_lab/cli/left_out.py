@@ -166,10 +166,8 @@ def judge(windows: EnsembleModel, sequence: SequenceModel, heard: HeardStream) -
 
 def renderer_figures(judged: Sequence[Judged], onsets_per_hour: float, learned_nats: float) -> Figures:
     """Return the row of a renderer: at a number of onsets per hour, and at the threshold of the others."""
-    quiet = dict[str, list[FloatArray]]()
-    for one, levels in judged:
-        if one.heard.hazard_free and not _misleads(one.heard):
-            quiet.setdefault(one.heard.site, []).append(levels)
+    calm = [(one.heard, levels) for one, levels in judged if one.heard.hazard_free]
+    quiet = ((heard.site, levels) for heard, levels in calm if not _misleads(heard))
     threshold_nats = measured_curve(quiet).default(onsets_per_hour).threshold_nats
     streams, learned = (_advised(judged, nats) for nats in (threshold_nats, learned_nats))
     found, false = examine(streams), _false_alarms(streams)

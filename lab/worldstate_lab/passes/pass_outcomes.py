@@ -215,10 +215,10 @@ def onsets_by_traffic(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
 
 def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Figures:
     """Return the detections of a level threshold at the same onset rate."""
-    quiet = [above_place_db(one.heard) for one in streams if one.heard.hazard_free]
+    quiet = [("", above_place_db(one.heard)) for one in streams if one.heard.hazard_free]
     if onsets_per_hour is None:
         return dict.fromkeys(("meter_detected", "meter_lead_missed_as_0_s", "meter_onsets_per_hour"))
-    least_db = measured_curve({"": quiet}).default(onsets_per_hour).threshold_nats
+    least_db = measured_curve(quiet).default(onsets_per_hour).threshold_nats
     louder = ((one.heard, raised_at(above_place_db(one.heard), least_db)) for one in streams)
     figures = approach_table([(heard, np.stack([on, on], axis=1)) for heard, on in louder]).loud().figures()
     return {f"meter_{name}": figures[name] for name in ("detected", "lead_missed_as_0_s", "onsets_per_hour")}

@@ -88,11 +88,11 @@ def _with_curve(
 
     if model.sequence is None or model.sequence.alarm is None:
         return model
-    quiet: dict[str, list[np.ndarray]] = {}
-    for stream in streams:
-        if "level_left" in stream.columns:
-            levels = np.column_stack([stream.level_left, stream.level_right])
-            quiet.setdefault(stream.about["site"], []).append(np.nan_to_num(levels, nan=-np.inf))
+    quiet = [
+        (one.about["site"], np.nan_to_num(np.column_stack([one.level_left, one.level_right]), nan=-np.inf))
+        for one in streams
+        if "level_left" in one.columns
+    ]
     curve, onsets = measured_curve(quiet), budget or model.sequence.alarm.onsets_per_hour
     check_hours("budget", curve.hours, onsets)
     return with_curve(model, curve, onsets)
