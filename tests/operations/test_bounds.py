@@ -27,11 +27,6 @@ positions_strategy = st.integers(0, 2**32 - 1).map(
 )
 
 
-def test_the_built_in_array_has_the_bound_of_the_paper():
-    variance = bearing_crb_rad2(roof_array_56().positions_m, 0.0, 1000.0, 1.0, 1)
-    assert np.rad2deg(np.sqrt(2 * variance)) == pytest.approx(1.8, abs=0.02)
-
-
 @settings(max_examples=40, deadline=None)
 @given(positions=positions_strategy, azimuth=st.floats(-3.1, 3.1), snr=st.floats(0.01, 100.0))
 def test_information_equals_a_numerical_fisher_matrix(positions, azimuth, snr):

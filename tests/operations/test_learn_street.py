@@ -59,39 +59,39 @@ def test_sound_of_two_arms_at_once_is_not_assigned(recording):
     assert heard.before(replace(first, t0=replace(first.t0, time_s=99.0)), [first]) is None
 
 
-def test_a_street_with_rates_of_the_version_before_is_read_with_a_note(street, tmp_path):
+@pytest.fixture
+def told(street, tmp_path):
+    """Return the content of a street file."""
     write_street(tmp_path / "street.json", street[-1])
-    told = json.loads((tmp_path / "street.json").read_text())
-    told["schema"]["version"] = "1.1.0"
+    return json.loads((tmp_path / "street.json").read_text())
+
+
+def read_again(told, folder, version="1.3.0"):
+    told["schema"]["version"] = version
+    (folder / "street.json").write_text(json.dumps(told))
+    return read_street(folder / "street.json")
+
+
+def test_a_street_with_rates_of_the_version_before_is_read_with_a_note(street, told, tmp_path):
     for arm in told["arms"]:
         arm["reveals"] = arm["departures"] = {"count": 3.0, "exposure_s": 7.0}
-    (tmp_path / "street.json").write_text(json.dumps(told))
     with pytest.warns(UserWarning, match="reveal and departure"):
-        before = read_street(tmp_path / "street.json")
+        before = read_again(told, tmp_path, "1.1.0")
     assert before == street[-1]
     assert context_of(before).rates == Rates()
-    told["schema"]["version"] = "2.0.0"
-    (tmp_path / "street.json").write_text(json.dumps(told))
     with pytest.raises(SchemaVersionError, match=r"2\.0\.0"):
-        read_street(tmp_path / "street.json")
+        read_again(told, tmp_path, "2.0.0")
 
 
-def test_a_street_file_with_wrong_arms_raises_an_error(street, tmp_path):
-    write_street(tmp_path / "street.json", street[-1])
-    told = json.loads((tmp_path / "street.json").read_text())
+def test_camera_misses_of_an_older_street_file_are_ignored(street, told, tmp_path):
+    older = told | {"looks": [3.0] * 18, "missed": [1.0] * 18}
+    assert read_again(older, tmp_path, "1.2.0") == street[-1]
+
+
+def test_a_street_file_with_wrong_arms_raises_an_error(told, tmp_path):
     told["arms"].reverse()
-    (tmp_path / "street.json").write_text(json.dumps(told))
     with pytest.raises(InputFileError, match="expected the arms"):
-        read_street(tmp_path / "street.json")
-
-
-def test_camera_misses_of_an_older_street_file_are_ignored(street, tmp_path):
-    write_street(tmp_path / "street.json", street[-1])
-    told = json.loads((tmp_path / "street.json").read_text())
-    told["schema"]["version"] = "1.2.0"
-    told |= {"looks": [3.0] * 18, "missed": [1.0] * 18}
-    (tmp_path / "street.json").write_text(json.dumps(told))
-    assert read_street(tmp_path / "street.json") == street[-1]
+        read_again(told, tmp_path)
 
 
 @pytest.mark.long
