@@ -74,12 +74,15 @@ def rows(out: Path, table: str) -> list:
     return list(corpus_rows(out, TABLES[table]))
 
 
+def words_of(corpus: Path, street: Path, out: Path) -> list[str]:
+    """Return the words of the command with the options of `heard`."""
+    given = ["--array", str(street / "mics.csv"), "--uncalibrated", "--out", str(out)]
+    return ["hear", str(corpus), *given]
+
+
 def contents(out: Path) -> dict[str, bytes]:
-    return {
-        str(one.relative_to(out)): one.read_bytes()
-        for one in out.rglob("*")
-        if one.is_file() and not one.name.startswith(".")
-    }
+    files = (one for one in out.rglob("[!.]*") if one.is_file())
+    return {str(one.relative_to(out)): one.read_bytes() for one in files}
 
 
 def test_an_array_without_a_model_gives_no_scores(street, tmp_path):
@@ -126,9 +129,8 @@ def test_a_corpus_has_the_advisories_of_run_and_the_seen_vehicle(demo):
 def test_tables_of_hops_and_logs_of_run_are_read_alike(demo, capsys):
     folder, _, _ = demo
     (hops,) = (folder / "heard" / "hops").glob("*.parquet")
-    printed = [
-        (main(["explain", str(log)]), capsys.readouterr().out) for log in (hops, folder / "states.jsonl")
-    ]
+    logs = hops, folder / "states.jsonl"
+    printed = [(main(["explain", str(log)]), capsys.readouterr().out) for log in logs]
     assert printed[0] == printed[1] and printed[0][0] == 0
     assert main(["log", "replay", str(hops), "--out", str(folder / "again.jsonl")]) == 0
     assert (folder / "again.jsonl").read_text() == (folder / "states.jsonl").read_text()
@@ -191,14 +193,6 @@ def test_an_unreadable_recording_is_a_row_with_its_error(heard):
     assert failed[0].failure.startswith("south/broken.wav: expected WAV")
 
 
-def test_a_log_of_snapshots_is_counted(heard, corpus):
-    logged = [row for row in rows(heard, "hours") if row.recording == "south/log.jsonl"]
-    states = [
-        WorldState.from_json(line) for line in (corpus / "south" / "log.jsonl").read_text().splitlines()
-    ]
-    assert sum(row.hops for row in logged) == len(states)
-
-
 def test_sound_and_its_bag_give_the_same_rows(street, options, tmp_path):
     pytest.importorskip("rosbags")
     samples, rate_hz = soundfile.read(street / "street.wav", dtype="float32")
@@ -241,9 +235,8 @@ def test_tables_do_not_depend_on_the_number_of_workers(way, corpus, options, hea
 
 def test_shards_add_up_to_the_whole(corpus, options, heard, tmp_path):
     shares = [hear(corpus, tmp_path, shard=(number, 3), **options) for number in (1, 2, 3)]
-    assert sorted(one.recording for share in shares for one in share) == [
-        one.name for one in find_corpus(corpus)
-    ]
+    names = sorted(one.recording for share in shares for one in share)
+    assert names == [one.name for one in find_corpus(corpus)]
     assert contents(tmp_path) == contents(heard)
 
 
@@ -298,18 +291,17 @@ def test_a_folder_begun_with_other_options_raises_an_error(named, corpus, option
 
 
 def test_a_manifest_has_sites_and_detections(corpus, tmp_path):
-    (corpus / "list.csv").write_text(
-        "path,site,detections\nsouth/c.wav,elm street,\nnorth/a.wav,,boxes.json\n"
-    )
+    lines = "path,site,detections", "south/c.wav,elm street,", "north/a.wav,,boxes.json", ""
+    (corpus / "list.csv").write_text("\n".join(lines))
     first, second = find_corpus(corpus / "list.csv")
     assert (first.name, first.site, first.detections) == ("north/a.wav", "", corpus / "boxes.json")
     assert (second.path, second.site, second.detections) == (corpus / "south/c.wav", "elm street", None)
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [("file\na.wav\n", "missing path"), ("path\na.wav\na.wav\n", "a.wav twice"), ("path\n", "got none")],
-)
+WRONG = [("file\na.wav\n", "missing path"), ("path\na.wav\na.wav\n", "a.wav twice"), ("path\n", "got none")]
+
+
+@pytest.mark.parametrize(("text", "problem"), WRONG)
 def test_wrong_manifests_raise_an_error(text, problem, tmp_path):
     (tmp_path / "list.csv").write_text(text)
     with pytest.raises(InputFileError, match=problem):
@@ -327,14 +319,10 @@ def states_of(raised: list[set[str]]) -> list[WorldState]:
     for hop, sides in enumerate(raised, start=1):
         stamp_ns = nanoseconds(0.1 * hop)
         since = {side: since.get(side, stamp_ns) for side in sides}
-        cues = [
-            RiskCue(
-                side, 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, None,
-                Advisory(since[side], stamp_ns) if side in since else None,
-            )
-            for side in ("left", "right")
-        ]  # fmt: skip
-        states.append(WorldState(stamp_ns, hop, context=Context(), cues=tuple(cues)))
+        told = {side: Advisory(since_ns, stamp_ns) for side, since_ns in since.items()}
+        each = ((side, told.get(side)) for side in ("left", "right"))
+        cues = tuple(RiskCue(side, 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, None, one) for side, one in each)
+        states.append(WorldState(stamp_ns, hop, context=Context(), cues=cues))
     return states
 
 
@@ -363,7 +351,7 @@ def test_an_unannounced_vehicle_is_an_approach():
 def test_shadow_hours_are_those_of_completed_recordings(corpus, heard, street, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(heard, out)
-    words = ["hear", str(corpus), "--array", str(street / "mics.csv"), "--uncalibrated", "--out", str(out)]
+    words = words_of(corpus, street, out)
     # As after a kill: there are tables without the row of the recording.
     killed = next(iter((out / "recordings").glob("*.parquet")))
     (out / "hours" / killed.name).with_stem("f" * 16 + "-left").write_bytes(b"")
@@ -421,10 +409,9 @@ def test_the_recall_of_a_cascade_is_measured_on_whole_recordings(quiet, options,
 @pytest.mark.long
 def test_tables_are_equal_with_two_workers_of_dask(corpus, street, heard, tmp_path):
     distributed = pytest.importorskip("distributed")
-    words = ["hear", str(corpus), "--array", str(street / "mics.csv"), "--uncalibrated"]
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
-        address = cluster.scheduler_address
-        assert main([*words, "--out", str(tmp_path), "--scheduler", address]) == 0
+        words = words_of(corpus, street, tmp_path)
+        assert main([*words, "--scheduler", cluster.scheduler_address]) == 0
         assert contents(tmp_path) == contents(heard)
 
 
@@ -438,16 +425,7 @@ def test_a_wrong_scheduler_raises_an_error(corpus, tmp_path, capsys, monkeypatch
 
 @pytest.mark.long
 def test_tables_are_equal_after_ten_kills(corpus, street, heard, tmp_path):
-    words = [
-        "hear",
-        str(corpus),
-        "--array",
-        str(street / "mics.csv"),
-        "--uncalibrated",
-        "--out",
-        str(tmp_path),
-    ]
-    finished = 0
+    words, finished = words_of(corpus, street, tmp_path), 0
     for kill in range(10):
         jobs = ["--jobs", "2"] if kill in (4, 7) else []
         with subprocess.Popen([sys.executable, "-m", "worldstate", *words, *jobs]) as run:

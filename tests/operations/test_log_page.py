@@ -73,12 +73,12 @@ def test_the_page_has_the_values_of_the_states(states, tmp_path):
         drawn = {one["id"]: one for one in row["entities"]}
         assert set(drawn) == {one.id[:8] for one in parts}
         for one in parts:
-            assert drawn[one.id[:8]]["hidden"] == (one.status == "hidden")
-            assert drawn[one.id[:8]]["azimuth"] == pytest.approx(np.degrees(one.azimuth_rad), abs=0.06)
-            assert drawn[one.id[:8]]["existence"] == pytest.approx(one.existence_probability, abs=1e-3)
-        assert [(one["sensor"], one["found"]) for one in row["searched"]] == [
-            (one.sensor, one.found) for one in state.searched
-        ]
+            shown = drawn[one.id[:8]]
+            assert shown["hidden"] == (one.status == "hidden")
+            assert shown["azimuth"] == pytest.approx(np.degrees(one.azimuth_rad), abs=0.06)
+            assert shown["existence"] == pytest.approx(one.existence_probability, abs=1e-3)
+        searched = [(one["sensor"], one["found"]) for one in row["searched"]]
+        assert searched == [(one.sensor, one.found) for one in state.searched]
         assert row["heard"] == pytest.approx({one.sensor: one.share for one in state.heard or ()}, abs=0.01)
     assert rows[-1]["entities"][0]["place"] == [8.0, 4.4]
 
@@ -174,9 +174,8 @@ def test_the_sound_of_the_page_starts_at_the_first_snapshot(states, since_ns, ra
     assert got_hz == rate_hz
     assert len(got) == pytest.approx(last - first, abs=1)
     begins = min(range(first - 1, first + 2), key=lambda k: abs(got[0] / 32768 - noise[k]))
-    assert got / 32768 == pytest.approx(
-        np.clip(noise, -1, 32767 / 32768)[begins:][: len(got)], abs=0.51 / 32768
-    )
+    expected = np.clip(noise, -1, 32767 / 32768)[begins:][: len(got)]
+    assert got / 32768 == pytest.approx(expected, abs=0.51 / 32768)
 
 
 def test_sound_is_resampled_and_gaps_are_silent(states):
@@ -204,20 +203,15 @@ def test_a_long_sound_is_cut_with_a_note(states, monkeypatch):
 
 def test_sound_in_another_format_raises_an_error(states):
     blocks = logged_sound(np.full(8000, 0.5, np.float32), 8000)
-    for wrong in (
-        {"number_of_channels": 2},
-        {"format": "pcm-f32"},
-        {"sample_rate": 0},
-        {"sample_rate": 10**9},
+    problem = "sound: expected pcm-s16 of one channel at one rate"
+    for name, wrong in (
+        *(("number_of_channels", 2), ("format", "pcm-f32")),
+        *(("sample_rate", 0), ("sample_rate", 10**9)),
     ):
-        for spoiled in (
-            [(0, replace(blocks[0][1], **wrong))],
-            [*blocks[:2], (2, replace(blocks[2][1], **wrong))],
-        ):
-            with pytest.raises(
-                InvalidArgumentError, match="sound: expected pcm-s16 of one channel at one rate"
-            ):
-                page_data(states, media=spoiled)
+        spoiled = replace(blocks[0][1], **{name: wrong})
+        for media in ([(0, spoiled)], [*blocks[:2], (2, spoiled)]):
+            with pytest.raises(InvalidArgumentError, match=problem):
+                page_data(states, media=media)
 
 
 def test_the_image_of_a_snapshot_is_the_last_one_at_or_before_it(states):
@@ -226,9 +220,8 @@ def test_the_image_of_a_snapshot_is_the_last_one_at_or_before_it(states):
     for early in ([], [0, stamps_ns[0] - 5]):
         data = page_data(states, media=logged_images([*early, *given]))
         assert not data["remarks"]
-        assert len(data["images"]) == 4 + bool(early), (
-            "no other one before the first snapshot or after the last"
-        )
+        # No other one before the first snapshot or after the last
+        assert len(data["images"]) == 4 + bool(early)
         for row, at_ns in zip(data["states"], stamps_ns, strict=True):
             before = [str(one).encode() for one in [*early, *given] if one <= at_ns]
             shown = data["images"][row["image"]] if row["image"] >= 0 else None
@@ -366,13 +359,11 @@ def test_a_browser_opens_the_page_without_errors_or_requests(states, tmp_path, w
         "since": (since_1970, {}),
         "empty": ([WorldState(0, 0)], {}),
     }
-    heard = replace(
-        states[0].entities[0], status=None, hidden_probability=None, classification=None, direction=None
-    )
+    unknown = dict.fromkeys(("status", "hidden_probability", "classification", "direction"))
+    heard = replace(states[0].entities[0], **unknown)
     pages["without a model"] = [replace(states[0], entities=(heard,), cues=())], {}
-    colours = (
-        "[...document.querySelectorAll('#street polygon, #charts path')].map(one => one.getAttribute('fill'))"
-    )
+    drawn_parts = "[...document.querySelectorAll('#street polygon, #charts path')]"
+    colours = f"{drawn_parts}.map(one => one.getAttribute('fill'))"
     dashes = "document.querySelectorAll('#evidence path[stroke-dasharray=\"6 4\"]').length"
     screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
     with browser(tmp_path / "profile") as page:
@@ -383,9 +374,8 @@ def test_a_browser_opens_the_page_without_errors_or_requests(states, tmp_path, w
             page.events.clear()
             page.open(path.as_uri())
             page.value("at('odds').open = true")
-            page.until(
-                f"at('odds').hidden || at('evidence').childElementCount >= {2 if name == 'whole' else 0}"
-            )
+            parts_shown = 2 if name == "whole" else 0
+            page.until(f"at('odds').hidden || at('evidence').childElementCount >= {parts_shown}")
             assert page.value(dashes) == (2 if name in ("whole", "since") else 0)
             drawn = {"var(--hidden)", "var(--view)", "var(--heard)"} & set(page.value(colours))
             assert (drawn == {"var(--heard)"}) == (name == "without a model")
@@ -415,14 +405,10 @@ def test_sound_slider_and_image_are_synchronous(states, log_with_media, tmp_path
         assert "space: play or pause, with sound" in page.value("document.body.textContent")
         for key, at in (("Home", 0), ("ArrowRight", 1), ("End", 5)):
             page.press(key)
-            assert page.value(held) == [
-                pytest.approx((states[at].stamp_ns - states[0].stamp_ns) / 1e9, abs=1e-4),
-                at,
-            ]
+            since_s = (states[at].stamp_ns - states[0].stamp_ns) / 1e9
+            assert page.value(held) == [pytest.approx(since_s, abs=1e-4), at]
             assert of_uri(page.value("document.querySelector('img').src"), "image/jpeg") == JPEGS[at % 2]
-        page.value(
-            "slider.value = 2; slider.dispatchEvent(new Event('input'))".replace("slider", "at('slider')")
-        )
+        page.value("at('slider').value = 2; at('slider').dispatchEvent(new Event('input'))")
         assert page.value(held) == [pytest.approx(0.2, abs=1e-4), 2]
         # Slower than the clock, it sets the pace, otherwise it would be paused halfway.
         page.value("document.querySelector('audio').playbackRate = 0.5")
@@ -430,10 +416,8 @@ def test_sound_slider_and_image_are_synchronous(states, log_with_media, tmp_path
         page.call("Runtime.evaluate", expression=space, userGesture=True)
         assert page.value("document.querySelector('audio').paused") is False
         sound = "document.querySelector('audio')"
-        ended = (
-            f"{sound}.paused || new Promise(done => {sound}.addEventListener('pause', done, {{once: true}}))"
-        )
-        page.call("Runtime.evaluate", expression=ended, awaitPromise=True)
+        once = f"new Promise(done => {sound}.addEventListener('pause', done, {{once: true}}))"
+        page.call("Runtime.evaluate", expression=f"{sound}.paused || {once}", awaitPromise=True)
         assert page.value(held) == [pytest.approx(0.5, abs=0.05), pytest.approx(5, abs=1)]
         assert not page.faults()
         assert [url for url in page.asked() if not url.startswith("data:")] == [path.as_uri()]

@@ -85,10 +85,8 @@ def test_the_snapshot_nearest_to_the_time_is_drawn(log, states, tmp_path, capsys
     stamps_s = [state.stamp_ns / 1e9 for state in states]
     assert all(a < b for a, b in pairwise(stamps_s))
     above = str(tmp_path / "above.png")
-    assert (
-        main(["log", "plot", str(log), "--birds-eye", above, "--time", f"{stamps_s[2] + 0.03}", "--json"])
-        == 0
-    )
+    words = ["log", "plot", str(log), "--birds-eye", above, "--time", f"{stamps_s[2] + 0.03}"]
+    assert main([*words, "--json"]) == 0
     assert f'"birds_eye_s": {stamps_s[2]}' in capsys.readouterr().out
 
 
