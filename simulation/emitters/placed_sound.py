@@ -1,6 +1,6 @@
 """Sound of a vehicle, its signal or a placed source at the microphones: paths, scattering, late field."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,14 +9,13 @@ from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, split_octaves
 from worldstate.simulation.scene.presets import Preset
 from worldstate.simulation.scene.settings import SoundKind, SoundSettings, sound_kind
-from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M, Trajectory, emit
+from worldstate.simulation.scene.vehicle import Trajectory, emit
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import screen_attenuation_db
 from worldstate.simulation.sound.propagation import ANY_ORDER, add_sources
-from worldstate.simulation.sound.receiver import Receiver, Surroundings
 from worldstate.simulation.sound.renderers import RENDERERS
-from worldstate.simulation.sound.scatter import add_scattered, scattering
-from worldstate.simulation.sound.static_field import PlacedSource, StreetSound, add_late_sound
+from worldstate.simulation.sound.scatter import add_scattered
+from worldstate.simulation.sound.static_field import StreetSound, add_late_sound
 
 from .emitter import emitted
 from .weather import add_gusts, add_rain, add_wind
@@ -29,28 +28,22 @@ BASS_BELOW_HZ = 177.0  # Between the octaves of 125 and 250 Hz
 
 def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator) -> None:
     """Add one vehicle to all microphones; its motion is given at the emission knots."""
-    static, site, preset, rate = street.static, street.site, street.preset, street.receiver.sample_rate_hz
+    site, preset, rate = street.site, street.preset, street.receiver.sample_rate_hz
     level = preset.vehicles_db(site) + site.surface_db + preset.vehicle_spread_db * rng.standard_normal()
     # The road surface affects the tyres alone.
     engine_db = preset.engine_spread_db * rng.standard_normal() - site.surface_db + engine_bass_db(preset)
     parts = emit(path, (len(path.time_s) - 1) * KNOT_SAMPLES, rate, level, rng, engine_db)
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
-    point = PlacedSource(whole, path.time_s, *path.behind(middle), SOURCE_HEIGHT_M)
+    point = street.source(whole, path.time_s, path.behind(middle))
     if renderer := RENDERERS.get(site.renderer):
         renderer.add_source(street, point, rng)
         return
-    around, far = _around(street), point.moving(rate)
-    near = [PlacedSource(one.signal, path.time_s, *path.behind(one.behind_m), one.height_m) for one in parts]
-    add_sources(static, [one.moving(rate) for one in near], around, ANY_ORDER[:POINT_REFLECTIONS])
-    add_sources(static, [far], around, ANY_ORDER[POINT_REFLECTIONS:])
-    add_scattered(static, far, around)
+    near = [street.source(one.signal, path.time_s, path.behind(one.behind_m), one.height_m) for one in parts]
+    add_sources(street, near, ANY_ORDER[:POINT_REFLECTIONS])
+    add_sources(street, [point], ANY_ORDER[POINT_REFLECTIONS:])
+    add_scattered(street, point)
     add_late_sound(street, whole, path.behind(0.0), path.time_s, rng)
-
-
-def _around(street: StreetSound) -> Surroundings:
-    preset = street.preset
-    return Surroundings(street.site, street.receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
 
 
 def engine_bass_db(preset: Preset) -> FloatArray:
@@ -75,16 +68,6 @@ ROOF_HEIGHT_M, ROOF_AWAY_M = 7.0, 4.0
 WEATHER = {"rain": add_rain, "gusts": add_gusts, "wind": add_wind}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SoundTrack:
-    """Position and facing of a sound at its emission knots, shape (T,) each."""
-
-    time_s: FloatArray
-    x_m: FloatArray
-    y_m: FloatArray
-    facing_rad: FloatArray
-
-
 def add_sound(street: StreetSound, sound: SoundSettings, rng: np.random.Generator) -> None:
     """Add one sound that does not belong to a vehicle to all microphones."""
     if sound.kind in WEATHER:
@@ -98,7 +81,7 @@ def add_sound(street: StreetSound, sound: SoundSettings, rng: np.random.Generato
     level = np.float32(10.0 ** (sound.level_offset_db / 20.0))
     signal[before : before + samples] = level * emitted(sound.what, samples, rate, rng, folder)
     time = sound.start_s + (np.arange(blocks + 1) - SILENT_BLOCKS) * KNOT_SAMPLES / rate
-    _add_from(street, signal, SoundTrack(time, *sound.at(time), sound.facing(time)), sound.what, rng)
+    _add_from(street, signal, time, sound.at(time), sound.facing(time), sound.what, rng)
 
 
 def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.random.Generator) -> None:
@@ -108,33 +91,38 @@ def add_signal(street: StreetSound, signal: str, path: Trajectory, rng: np.rando
     (front_x, front_y), (rear_x, rear_y) = path.behind(0.0), path.behind(path.kind.length_m)
     heading = np.arctan2(kind.faces * (front_y - rear_y), kind.faces * (front_x - rear_x))
     place = (front_x, front_y) if kind.faces > 0.0 else (rear_x, rear_y)
-    track = SoundTrack(path.time_s, *place, heading)
     pressure = emitted(kind, samples, street.receiver.sample_rate_hz, rng, street.preset.sounds_folder)
-    _add_from(street, pressure, track, kind, rng)
+    _add_from(street, pressure, path.time_s, place, heading, kind, rng)
 
 
 def _add_from(
-    street: StreetSound, signal: Float32Array, track: SoundTrack, kind: SoundKind, rng: np.random.Generator
+    street: StreetSound,
+    signal: Float32Array,
+    time_s: FloatArray,
+    place_m: tuple[FloatArray, FloatArray],
+    facing_rad: FloatArray,
+    kind: SoundKind,
+    rng: np.random.Generator,
 ) -> None:
     """Add a sound along every path; walls and the late field receive its mean over all directions."""
-    static, site, receiver = street.static, street.site, street.receiver
-    rate, ego_x = receiver.sample_rate_hz, receiver.ego.x_m(track.time_s)
-    angle = np.arctan2(-track.y_m, ego_x - track.x_m) - track.facing_rad
+    site, rate, (x, y) = street.site, street.receiver.sample_rate_hz, place_m
+    to_ego = street.receiver.ego.x_m(time_s) - x
+    angle = np.arctan2(-y, to_ego) - facing_rad
     towards = _gained(signal, directivity(kind, angle), rate) * GROUND_GAIN
-    renderer, around = RENDERERS.get(site.renderer), _around(street)
-    source = PlacedSource(towards, track.time_s, track.x_m, track.y_m, kind.height_m)
-    if not (renderer and renderer.over_roofs) and not in_the_streets(site, track).all():
-        over = _gained(towards, over_roofs(track, kind.height_m, receiver, around.cap_db), rate)
-        beyond = replace(source, signal=over).moving(rate)
-        add_sources(static, [beyond], replace(around, site=in_the_open(site)))
+    renderer = RENDERERS.get(site.renderer)
+    if not (renderer and renderer.over_roofs) and not in_the_streets(site, x, y).all():
+        over = _gained(towards, over_roofs(street, np.hypot(to_ego, y), kind.height_m), rate)
+        beyond = street.source(over, time_s, place_m, kind.height_m)
+        add_sources(replace(street, site=in_the_open(site)), [beyond])
         return
+    source = street.source(towards, time_s, place_m, kind.height_m)
     if renderer:
         renderer.add_source(street, source, rng)
         return
-    add_sources(static, [source.moving(rate)], around)
+    add_sources(street, [source])
     mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN
-    add_scattered(static, replace(source, signal=mean).moving(rate), around)
-    add_late_sound(street, mean, (track.x_m, track.y_m), track.time_s, rng)
+    add_scattered(street, street.source(mean, time_s, place_m, kind.height_m))
+    add_late_sound(street, mean, place_m, time_s, rng)
 
 
 def directivity(kind: SoundKind, angle_rad: FloatArray) -> FloatArray:
@@ -153,9 +141,8 @@ def mean_gain(kind: SoundKind) -> FloatArray:
     return np.asarray(np.sqrt(np.square(every).mean(axis=0)))
 
 
-def in_the_streets(site: Site, track: SoundTrack) -> BoolArray:
+def in_the_streets(site: Site, x: FloatArray, y: FloatArray) -> BoolArray:
     """Return when a sound is in the ego's or the crossing street, or in the open, shape (T,)."""
-    x, y = track.x_m, track.y_m
     if site.is_open:
         return np.ones(len(x), np.bool_)
     own = (x <= site.corner_ahead_m) & (y <= site.side_wall_left_m) & (y >= -site.side_wall_right_m)
@@ -163,10 +150,9 @@ def in_the_streets(site: Site, track: SoundTrack) -> BoolArray:
     return own | ((x >= site.corner_ahead_m) & (x <= end))
 
 
-def over_roofs(track: SoundTrack, height_m: float, receiver: Receiver, cap_db: float) -> FloatArray:
+def over_roofs(street: StreetSound, away: FloatArray, height_m: float) -> FloatArray:
     """Return the amplitude over the nearest roof, relative to a straight line, per octave, shape (T, 8)."""
-    _, _, array_z = receiver.centre_m
-    away = np.hypot(track.x_m - receiver.ego.x_m(track.time_s), track.y_m)
+    (_, _, array_z), cap_db = street.receiver.centre_m, street.preset.screen_cap_db
     beyond, rise = np.maximum(away - ROOF_AWAY_M, 0.0), ROOF_HEIGHT_M - array_z
     bent = np.hypot(ROOF_AWAY_M, rise) + np.hypot(beyond, ROOF_HEIGHT_M - height_m)
     detour = bent - np.hypot(away, height_m - array_z)

@@ -14,7 +14,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.octave_bands import split_octaves
-from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
 
 from .diffraction import SPEED_OF_SOUND_MPS
 
@@ -192,19 +191,3 @@ class Emission:
         both = np.matmul(np.stack([ends[:-1], np.diff(ends, axis=0)], axis=1), self.bands[first : last - 1])
         values = (both[:, 0] + _one_and_ramp(both.shape[2])[1] * both[:, 1]).ravel()
         return SampledSignal(values, self.knots_s[first], self.sample_rate_hz * OVERSAMPLING), span
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MovingSource:
-    """A sound and its position."""
-
-    emission: Emission  # Emitted sound
-    # shape (T,): Distance ahead at the knots of `emission`, or one value for a lane.
-    x_m: float | FloatArray
-    y_m: FloatArray  # shape (T,): Lateral position at the same knots
-    height_m: float = SOURCE_HEIGHT_M  # Above the road
-
-    @property
-    def ahead_m(self) -> FloatArray:
-        """Distance ahead, shape (T,)."""
-        return np.asarray(self.x_m + np.zeros_like(self.y_m))

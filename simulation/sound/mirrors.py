@@ -24,7 +24,6 @@ from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
 from worldstate.simulation.scene.presets import Ambience
 
 from .background import Town, direction_numbers
-from .delay import Emission
 from .diffraction import air_gain, corner_gain, ground_gain
 from .receiver import Receiver, add_to_all, passed_places
 from .static_field import PlacedSource, StreetSound
@@ -252,18 +251,15 @@ class Way:
 
 def add_mirrored(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
     """Add a source by all its images and by the waves that both corners diffract."""
-    receiver = street.receiver
-    emission = source.moving(receiver.sample_rate_hz).emission
-    _, heard_x = source.straight_m(receiver.centre_m, receiver)
-    for place in passed_places(heard_x, PLACES_M):
-        _add_near(street, source.during(place[1]), emission, *place)
+    _, heard_x = source.straight_m(street.receiver.centre_m, street.receiver)
+    for x_m, span, share in passed_places(heard_x, PLACES_M):
+        _add_near(street, source.during(span), x_m, span, share)
 
 
-def _add_near(
-    street: StreetSound, source: PlacedSource, emission: Emission, x_m: float, span: slice, share: FloatArray
-) -> None:
+def _add_near(street: StreetSound, source: PlacedSource, x_m: float, span: slice, share: FloatArray) -> None:
     """Add the sound of a source while the ego is near a place; lengths follow the ego's motion."""
-    receiver, centre = street.receiver, street.receiver.centre_m + np.array([x_m, 0.0, 0.0])
+    receiver, emission = street.receiver, source.emission
+    centre = receiver.centre_m + np.array([x_m, 0.0, 0.0])
     ways, whole = ways_of(street.site, source, centre), np.zeros((len(emission.knots_s), len(OCTAVES_HZ)))
     lengths = [way.length_m(centre) for way in ways]
     loud = np.array([way.gain[:, 3] / length for way, length in zip(ways, lengths, strict=True)])

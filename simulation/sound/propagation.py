@@ -12,11 +12,10 @@ from worldstate.simulation.scene.occluders import OccludingBody, detours, walls
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, smooth_step
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
 
-from .delay import MovingSource
 from .diffraction import SPEED_OF_SOUND_MPS, air_gain, ground_gain, screen_attenuation_db
 from .paths import LEFT, RIGHT, Path, ReceiverImage, receiver_images, side_walls, trace_paths
-from .receiver import Receiver, Surroundings, add_along, add_to_all, add_turning, in_own_street
-from .static_field import StaticSources
+from .receiver import Receiver, add_along, add_to_all, add_turning, in_own_street
+from .static_field import PlacedSource, StreetSound
 
 BLEND_M = 0.02  # Length of the detour over which a line that touches a body becomes the path round it
 
@@ -86,50 +85,45 @@ ANY_ORDER = range(99)
 FAINTEST = 3e-3  # Paths below this share of the total amplitude are left out (features change by 4e-4 rms)
 
 
-def add_sources(
-    static: StaticSources,
-    sources: Sequence[MovingSource],
-    around: Surroundings,
-    reflections: range = ANY_ORDER,
-) -> None:
+def add_sources(street: StreetSound, sources: Sequence[PlacedSource], reflections: range = ANY_ORDER) -> None:
     """Add moving sources to all microphones by all paths up to a number of reflections."""
-    if around.site.is_open:
+    if street.site.is_open:
         for source in sources if 0 in reflections else ():
-            _add_open(static.out, source, around)
+            _add_open(street, source)
         return
-    images = receiver_images(around.site)
-    bent = np.zeros((len(images), 2, around.receiver.samples), np.float32)
+    images = receiver_images(street.site)
+    bent = np.zeros((len(images), 2, street.receiver.samples), np.float32)
     for source in sources:
-        for path in _audible(_paths(source, around)):
+        for path in _audible(_paths(source, street)):
             if path.source.order + path.receiver.order not in reflections:
                 continue
             for edge in (LEFT, RIGHT):
-                _add_bent(bent[images.index(path.receiver), edge], source, path, edge, around)
-            _add_lit(static.out, source, path, around.receiver)
-    _add_corners(static, bent, images, around)
+                _add_bent(bent[images.index(path.receiver), edge], source, path, edge, street)
+            _add_lit(street, source, path)
+    _add_corners(street, bent, images)
 
 
-def _paths(source: MovingSource, around: Surroundings) -> list[Path]:
-    receiver = around.receiver
+def _paths(source: PlacedSource, street: StreetSound) -> list[Path]:
+    receiver, site = street.receiver, street.site
     above = receiver.above(source.height_m)
     flat = source.y_m**2 + above**2
     _, heard_x = receiver.arrivals(source.emission.knots_s, partial(_slant, source.x_m, flat))
-    mirrored = np.sqrt(1.0 - around.scattered(True)), np.sqrt(1.0 - around.scattered(False))
-    place = source.x_m, source.y_m, above
-    paths = trace_paths(around.site, *place, around.cap_db, receiver_x_m=heard_x, specular=mirrored)
-    beside = in_own_street(around.site, source.x_m, source.y_m)
+    mirrored = np.sqrt(1.0 - street.scattered(True)), np.sqrt(1.0 - street.scattered(False))
+    place, cap_db = (source.x_m, source.y_m, above), street.preset.screen_cap_db
+    paths = trace_paths(site, *place, cap_db, receiver_x_m=heard_x, specular=mirrored)
+    beside = in_own_street(site, source.x_m, source.y_m)
     if beside.any():
-        paths = [_beside(path, source, beside, mirrored[1], heard_x, around) for path in paths]
-    return [replace(path, gain=path.gain * _media(path.bent_m, source, around)) for path in paths]
+        paths = [_beside(path, source, beside, mirrored[1], heard_x, street) for path in paths]
+    return [replace(path, gain=path.gain * media_gain(path.bent_m, source, receiver)) for path in paths]
 
 
 def _beside(
     path: Path,
-    source: MovingSource,
+    source: PlacedSource,
     share: FloatArray,
     specular: FloatArray,
-    heard_x_m: float | FloatArray,
-    around: Surroundings,
+    heard_x_m: FloatArray,
+    street: StreetSound,
 ) -> Path:
     """Return the path of a source whose `share` is in the ego's own street.
 
@@ -142,9 +136,9 @@ def _beside(
         # This path meets the near facade first, and a source in the ego's street is behind that facade.
         return replace(path, gain=path.gain * (1.0 - share)[:, None])
     across = source.y_m - image.offset_m
-    above = around.receiver.above(source.height_m)
+    above = street.receiver.above(source.height_m)
     straight = np.sqrt((source.x_m - heard_x_m) ** 2 + across**2 + above**2)
-    walls = side_walls(around.site, image, heard_x_m, (source.x_m, source.y_m))
+    walls = side_walls(street.site, image, heard_x_m, (source.x_m, source.y_m))
     whole = image.gain * walls[:, None] * specular**image.order
     return replace(
         path,
@@ -154,11 +148,9 @@ def _beside(
     )
 
 
-def _media(length_m: FloatArray, source: MovingSource, around: Surroundings) -> float | FloatArray:
+def media_gain(length_m: FloatArray, source: PlacedSource, receiver: Receiver) -> FloatArray:
     """Return the amplitude after air and road per octave, shape (T, 8)."""
-    if not around.outdoors:
-        return 1.0
-    return air_gain(length_m) * ground_gain(length_m, source.height_m, float(around.receiver.centre_m[2]))
+    return air_gain(length_m) * ground_gain(length_m, source.height_m, float(receiver.centre_m[2]))
 
 
 def _audible(paths: list[Path]) -> list[Path]:
@@ -168,21 +160,22 @@ def _audible(paths: list[Path]) -> list[Path]:
     return [path for path, peak in zip(paths, share.max(axis=1), strict=True) if peak > FAINTEST]
 
 
-def _add_bent(out: Float32Array, source: MovingSource, path: Path, edge: int, around: Surroundings) -> None:
+def _add_bent(out: Float32Array, source: PlacedSource, path: Path, edge: int, street: StreetSound) -> None:
     """Add the sound that reaches the array's centre round one corner."""
     made = source.emission.table(path.gain * ((1.0 - path.lit) * (path.edge == edge))[:, None])
     if made is None:
         return
     table, span = made
-    receiver, mouth = around.receiver, around.site.corner_ahead_m
+    receiver, mouth = street.receiver, street.site.corner_ahead_m
     before, above = path.before_m[span], receiver.above(source.height_m)
     knots, across = source.emission.knots_s[span], path.edge_y_m[span] - path.receiver.offset_m
     travel, _ = receiver.arrivals(knots, partial(_round, before, mouth, across, above))
     add_along(out, table, knots, travel, receiver.knots_s)
 
 
-def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Receiver) -> None:
+def _add_lit(street: StreetSound, source: PlacedSource, path: Path) -> None:
     """Add the sound that reaches every microphone along the straight line."""
+    receiver = street.receiver
 
     def travel(position: FloatArray) -> FloatArray:
         across = source.y_m - path.receiver.mirror(position[1:2])
@@ -190,26 +183,26 @@ def _add_lit(out: Float32Array, source: MovingSource, path: Path, receiver: Rece
         ahead = path.source.x_m - position[0]
         return receiver.arrivals(source.emission.knots_s, partial(_slant, ahead, flat))[0]
 
-    add_to_all(out, source.emission, path.gain * path.lit[:, None], travel, receiver)
+    add_to_all(street.static.out, source.emission, path.gain * path.lit[:, None], travel, receiver)
 
 
 def _slant(along: float | FloatArray, flat_squared: FloatArray, x_m: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt((along - x_m) ** 2 + flat_squared))
 
 
-def _add_open(out: Float32Array, source: MovingSource, around: Surroundings) -> None:
+def _add_open(street: StreetSound, source: PlacedSource) -> None:
     """Add the sound that reaches every microphone in the open: straight, by a wall, or round a body."""
-    receiver, knots, ahead = around.receiver, source.emission.knots_s, source.ahead_m
+    receiver, cap_db = street.receiver, street.preset.screen_cap_db
     flat = source.y_m**2 + receiver.above(source.height_m) ** 2
-    _, heard_x = receiver.arrivals(knots, partial(_slant, ahead, flat))
-    for image in open_images(around.site, ahead, source.y_m, heard_x):
+    _, heard_x = receiver.arrivals(source.emission.knots_s, partial(_slant, source.x_m, flat))
+    for image in open_images(street.site, source.x_m, source.y_m, heard_x):
         straight = np.sqrt((image.x_m - heard_x) ** 2 + image.y_m**2 + receiver.above(source.height_m) ** 2)
-        gain = image.gain * _media(straight, source, around)
-        for leg in screened_legs(image.occluders, image.x_m, image.y_m, heard_x, around.cap_db):
-            _add_leg(out, source, replace(leg, gain=leg.gain * gain), receiver)
+        gain = image.gain * media_gain(straight, source, receiver)
+        for leg in screened_legs(image.occluders, image.x_m, image.y_m, heard_x, cap_db):
+            _add_leg(street.static.out, source, replace(leg, gain=leg.gain * gain), receiver)
 
 
-def _add_leg(out: Float32Array, source: MovingSource, leg: ScreenedLeg, receiver: Receiver) -> None:
+def _add_leg(out: Float32Array, source: PlacedSource, leg: ScreenedLeg, receiver: Receiver) -> None:
     """Add the sound that reaches every microphone past one point, or straight."""
 
     def travel(position: FloatArray) -> FloatArray:
@@ -226,11 +219,9 @@ def _round(
     return np.asarray(np.hypot(before + np.hypot(along - x_m, across), rise))
 
 
-def _add_corners(
-    static: StaticSources, bent: Float32Array, images: list[ReceiverImage], around: Surroundings
-) -> None:
+def _add_corners(street: StreetSound, bent: Float32Array, images: list[ReceiverImage]) -> None:
     """Add the sound of every corner, in every side image, to all microphones."""
-    site, receiver = around.site, around.receiver
+    site, receiver, static = street.site, street.receiver, street.static
     places = [(image, y) for image in images for y in (site.corner_left_m, -site.corner_right_m)]
     signals = bent.reshape(-1, bent.shape[2])
     used = np.flatnonzero(np.abs(signals).max(axis=1) > 0.0)

@@ -278,7 +278,7 @@ LIT_BLEND_M = 0.5  # Length of a source's path over which direct sound appears
 def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generator) -> None:
     """Add a source by all ray directions, round both corners, over roofs, and straight."""
     static, site, receiver = street.static, street.site, street.receiver
-    emission = source.moving(receiver.sample_rate_hz).emission
+    emission = source.emission
     length, heard_x = receiver.arrivals(source.time_s, partial(_way_m, site, source))
     lit = _lit(site, source, heard_x)
     ways = [*_echoes(source, street, heard_x, rng), *_edges(source, street, heard_x, lit)]

@@ -1,4 +1,4 @@
-"""Standing or moving microphones, and the media between them and the sources."""
+"""Standing or moving microphones, and sound on its way to all of them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site
-from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, resample_whole, smooth_step
+from worldstate.simulation.scene.octave_bands import resample_whole, smooth_step
 from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, EgoMotion
 
 from .delay import KNOT_SAMPLES, PHASES, Emission, Phases, SampledSignal, add_delayed, emission_times
@@ -115,11 +115,16 @@ def distance_m(place_m: FloatArray, x_m: FloatArray, offset_m: FloatArray) -> Fl
 
 
 def add_along(
-    out: Float32Array, table: SampledSignal, emit_s: FloatArray, travel_m: FloatArray, receive_s: FloatArray
+    out: Float32Array,
+    table: SampledSignal,
+    emit_s: FloatArray,
+    travel_m: FloatArray,
+    receive_s: FloatArray,
+    spread_m: FloatArray | None = None,
 ) -> None:
-    """Add sound that was emitted at the knots `emit_s` and has travelled `travel_m`, with spreading loss."""
+    """Add sound that was emitted at `emit_s` and travelled `travel_m`, with loss over that or `spread_m`."""
     emit = emission_times(receive_s, emit_s, travel_m)
-    length = np.interp(np.nan_to_num(emit), emit_s, travel_m)
+    length = np.interp(np.nan_to_num(emit), emit_s, travel_m if spread_m is None else spread_m)
     add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
 
 
@@ -195,23 +200,7 @@ def add_turning(
 MOUTH_BLEND_M = 0.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
-    """Walls and bodies between the sources and the microphones, and their effect on sound."""
-
-    site: Site
-    receiver: Receiver
-    cap_db: float  # Largest screen attenuation
-    # shape (8,): Share of the energy that rough walls scatter in place of mirroring it, per octave.
-    scattering: FloatArray = field(default_factory=lambda: np.zeros(len(OCTAVES_HZ)))
-    outdoors: bool = False  # Whether air and road change the sound
-
-    def scattered(self, beyond_mouth: bool) -> FloatArray:
-        """Return the share that the crossing street's facades, or the side walls, scatter, shape (8,)."""
-        return np.minimum(self.scattering * self.site.roughness[int(beyond_mouth)], 1.0)
-
-
-def in_own_street(site: Site, x_m: float | FloatArray, y_m: FloatArray) -> FloatArray:
+def in_own_street(site: Site, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
     """Return 1 if a source is between the side walls of the ego's street and 0 beyond its mouth, shape (T,).
 
     Examples
@@ -220,6 +209,6 @@ def in_own_street(site: Site, x_m: float | FloatArray, y_m: FloatArray) -> Float
     >>> in_own_street(plan, np.array([8.0, 3.0, -20.0, -20.0]), np.array([0.0, 0.0, 2.9, 9.0]))
     array([0., 1., 1., 0.])
     """
-    before = smooth_step(np.asarray(site.corner_ahead_m - x_m) / MOUTH_BLEND_M)
+    before = smooth_step((site.corner_ahead_m - x_m) / MOUTH_BLEND_M)
     gap = np.minimum(site.side_wall_left_m - y_m, y_m + site.side_wall_right_m)
     return np.asarray(before * smooth_step(1.0 + gap / MOUTH_BLEND_M))

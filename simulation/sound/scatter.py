@@ -20,9 +20,8 @@ import numpy as np
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
-from worldstate.simulation.scene.presets import Preset
 
-from .delay import KNOT_SAMPLES, Emission, MovingSource, add_delayed, emission_times
+from .delay import KNOT_SAMPLES, Emission
 from .diffraction import SPEED_OF_SOUND_MPS
 from .paths import (
     ReceiverImage,
@@ -34,8 +33,8 @@ from .paths import (
     source_images,
     through_mouth,
 )
-from .receiver import NEAREST_M, Receiver, Surroundings, add_turning, distance_m
-from .static_field import StaticSources
+from .receiver import NEAREST_M, Receiver, add_along, add_turning, distance_m
+from .static_field import PlacedSource, StaticSources, StreetSound
 
 PATCH_M = 0.9  # Length along the wall
 WALL_HEIGHT_M = 3.0  # Height of the part of a wall that is near enough to matter
@@ -44,7 +43,6 @@ BEHIND_M = 1.5  # Side walls scatter from this distance behind the array
 OPPOSITE_PATCH_M = 1.4
 # Factor on the part of the wall opposite in view of the array: the side walls see more of it, from aside
 OPPOSITE_REACH = 2.2
-SCATTER_HZ = 400.0  # Relief of a few decimetres: below this frequency a facade is smooth
 IMAGE_ORDERS = 2  # Reflections in the crossing street before a patch
 
 
@@ -57,20 +55,6 @@ class Patches:
     # shape (P,): :math:`\sqrt{w A \rho^2 / \pi}`, the scattering length at normal incidence.
     strengths_m: FloatArray
     beyond_mouth: bool  # Whether the patches are in the crossing street
-
-
-def scattering(preset: Preset) -> FloatArray:
-    """Return the scattering coefficient sigma per octave, shape (8,).
-
-    Examples
-    --------
-    >>> from worldstate.simulation.scene.presets import preset
-    >>> sigma = scattering(preset())
-    >>> sigma[[0, -1]].round(3)
-    array([0.004, 0.15 ])
-    """
-    relief = (OCTAVES_HZ / SCATTER_HZ) ** 2
-    return preset.wall_scattering * relief / (1.0 + relief)
 
 
 def patches(site: Site) -> list[Patches]:
@@ -129,29 +113,29 @@ def _strengths(
 FirstLeg: TypeAlias = tuple[FloatArray, FloatArray]
 
 
-def first_legs(group: Patches, index: int, source: MovingSource, around: Surroundings) -> list[FirstLeg]:
+def first_legs(group: Patches, index: int, source: PlacedSource, street: StreetSound) -> list[FirstLeg]:
     """Return the paths of one source to one patch: direct and by the facades of the crossing street."""
     if not group.beyond_mouth:
-        near = [image for image in source_images(around.site, source.x_m) if image.order <= IMAGE_ORDERS]
-        return [_mouth_leg(group, index, image, source, around) for image in near]
+        near = [image for image in source_images(street.site, source.x_m) if image.order <= IMAGE_ORDERS]
+        return [_mouth_leg(group, index, image, source, street) for image in near]
     x, y, z = group.positions_m[index]
-    away = np.stack([source.ahead_m - x, source.y_m - y], axis=1)
+    away = np.stack([source.x_m - x, source.y_m - y], axis=1)
     length = np.sqrt((away**2).sum(axis=1) + (z - source.height_m) ** 2)
     cosine = np.abs(away @ group.normals[index]) / np.maximum(length, NEAREST_M)
     return [(length, (group.strengths_m[index] * np.sqrt(cosine))[:, None] * np.ones(len(OCTAVES_HZ)))]
 
 
 def _mouth_leg(
-    group: Patches, index: int, image: SourceImage, source: MovingSource, around: Surroundings
+    group: Patches, index: int, image: SourceImage, source: PlacedSource, street: StreetSound
 ) -> FirstLeg:
-    site, (x, y, z) = around.site, group.positions_m[index]
+    site, (x, y, z) = street.site, group.positions_m[index]
     passage = through_mouth(site, (image.x_m, source.y_m), (x, y), z - source.height_m)
     away = np.stack([np.full_like(source.y_m, site.corner_ahead_m - x), passage.aim_y_m - y], axis=1)
     cosine = np.abs(away @ group.normals[index]) / np.maximum(np.hypot(*away.T), NEAREST_M)
     length = passage.lit * passage.straight_m + (1.0 - passage.lit) * passage.bent_m
     walls = image.gain * near_facade(site, image, source.y_m, passage.aim_y_m)
     gain = group.strengths_m[index] * np.sqrt(cosine) * walls
-    return length, gain[:, None] * passage.screen_gain(around.cap_db)
+    return length, gain[:, None] * passage.screen_gain(street.preset.screen_cap_db)
 
 
 def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -187,23 +171,23 @@ FAINTEST = 1e-3
 STRETCH_KNOTS = 64  # A sixth of a second: interval of that decision
 
 
-def add_scattered(static: StaticSources, source: MovingSource, around: Surroundings) -> None:
+def add_scattered(street: StreetSound, source: PlacedSource) -> None:
     """Add the sound of one moving source that rough walls scatter, to all microphones."""
-    if not around.scattering.any() or around.site.is_open:
+    if not street.preset.wall_scattering or street.site.is_open:
         return
     every: list[_Shown] = []
-    for group in patches(around.site):
-        arrived = np.zeros((len(group.strengths_m), around.receiver.samples), np.float32)
+    for group in patches(street.site):
+        arrived = np.zeros((len(group.strengths_m), street.receiver.samples), np.float32)
         for index, signal in enumerate(arrived):
-            for length_m, gain in first_legs(group, index, source, around):
-                sent = length_m, gain * np.sqrt(around.scattered(group.beyond_mouth))
-                _add_leg(signal, source.emission, sent, around, group.positions_m[index])
-        every += _shown(group, arrived, around)
-    _add_shown(static, every, around.receiver)
+            for length_m, gain in first_legs(group, index, source, street):
+                sent = length_m, gain * np.sqrt(street.scattered(group.beyond_mouth))
+                _add_leg(signal, source.emission, sent, street.receiver, group.positions_m[index])
+        every += _shown(group, arrived, street)
+    _add_shown(street.static, every, street.receiver)
 
 
 def _add_leg(
-    out: Float32Array, emission: Emission, leg: FirstLeg, around: Surroundings, patch_m: FloatArray
+    out: Float32Array, emission: Emission, leg: FirstLeg, receiver: Receiver, patch_m: FloatArray
 ) -> None:
     """Add the sound of one patch, delayed as at the array's centre."""
     length_m, gain = leg
@@ -211,12 +195,9 @@ def _add_leg(
     if made is None:
         return
     table, span = made
-    receiver = around.receiver
     knots, first = emission.knots_s[span], length_m[span]
     total, _ = receiver.arrivals(knots, lambda x: first + distance_m(patch_m, x, receiver.centre_m))
-    emit = emission_times(receiver.knots_s, knots, total)
-    length = np.interp(np.nan_to_num(emit), knots, first)
-    add_delayed(out, table, emit, 1.0 / np.maximum(length, NEAREST_M))
+    add_along(out, table, knots, total, receiver.knots_s, first)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,9 +216,9 @@ class _Shown:
         return np.concatenate([np.zeros(by, np.float32), sent[: len(sent) - by]])
 
 
-def _shown(group: Patches, arrived: Float32Array, around: Surroundings) -> list[_Shown]:
+def _shown(group: Patches, arrived: Float32Array, street: StreetSound) -> list[_Shown]:
     """Return the patches and, for the wall opposite, their images in the side walls."""
-    site, receiver = around.site, around.receiver
+    site, receiver = street.site, street.receiver
     x, count = receiver.ego.x_m(receiver.knots_s), len(arrived)
     if not group.beyond_mouth:
         seen = np.ones((count, len(x)))

@@ -14,9 +14,11 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from worldstate.ground.typing import Complex64Array, Float32Array, FloatArray
 from worldstate.simulation.scene.junction import Site, site_generator
+from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.simulation.scene.presets import Preset
+from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
 
-from .delay import KNOT_SAMPLES, Emission, MovingSource
+from .delay import KNOT_SAMPLES, Emission
 from .diffraction import SPEED_OF_SOUND_MPS
 from .receiver import Receiver, distance_m
 
@@ -112,6 +114,7 @@ def _analyse(signals: list[Float32Array]) -> Iterator[tuple[int, Complex64Array]
         yield start, spectra
 
 
+SCATTER_HZ = 400.0  # Relief of a few decimetres: below this frequency a facade is smooth
 DIRECTIONS = 48
 LOBES, LOBE_CONCENTRATION, LOBE_SPAN_RAD = 4, 8.0, 1.3
 ELEVATION_RAD = 0.3
@@ -142,24 +145,14 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StreetSound:
-    """Outputs to which the sounds of a street are added, and the properties of the street."""
-
-    static: StaticSources
-    site: Site
-    preset: Preset
-    receiver: Receiver
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PlacedSource:
     """The sound of one point and its position at its emission knots."""
 
-    signal: Float32Array  # shape (n,)
+    emission: Emission
     time_s: FloatArray  # shape (T,): The knots
     x_m: FloatArray  # shape (T,)
     y_m: FloatArray
-    height_m: float
+    height_m: float  # Above the road
 
     def straight_m(self, position_m: FloatArray, receiver: Receiver) -> tuple[FloatArray, FloatArray]:
         """Return the distance to a position (3,) on the ego and the ego's place at arrival, (T,) each."""
@@ -170,10 +163,32 @@ class PlacedSource:
         """Return the part of it at some of its knots."""
         return replace(self, time_s=self.time_s[span], x_m=self.x_m[span], y_m=self.y_m[span])
 
-    def moving(self, rate_hz: float) -> MovingSource:
-        """Return it in the form of the first renderer."""
-        emission = Emission.of(self.signal, float(self.time_s[0]), rate_hz)
-        return MovingSource(emission, self.x_m, self.y_m, self.height_m)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreetSound:
+    """Outputs to which the sounds of a street are added, and the properties of the street."""
+
+    static: StaticSources
+    site: Site
+    preset: Preset
+    receiver: Receiver
+
+    def scattered(self, beyond_mouth: bool) -> FloatArray:
+        """Return the share of the energy that facades beyond the mouth, or the side walls, scatter, (8,)."""
+        relief = (OCTAVES_HZ / SCATTER_HZ) ** 2
+        coefficient = self.preset.wall_scattering * relief / (1.0 + relief)
+        return np.minimum(coefficient * self.site.roughness[int(beyond_mouth)], 1.0)
+
+    def source(
+        self,
+        signal: Float32Array,
+        time_s: FloatArray,
+        place_m: tuple[FloatArray, FloatArray],
+        height_m: float = SOURCE_HEIGHT_M,
+    ) -> PlacedSource:
+        """Return the source of a signal that is at a place (x, y) at each of its knots."""
+        emission = Emission.of(signal, float(time_s[0]), self.receiver.sample_rate_hz)
+        return PlacedSource(emission, time_s, *place_m, height_m)
 
 
 def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Generator) -> None:

@@ -25,12 +25,12 @@ from worldstate.simulation.scene.junction import SITES
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SimulationSettings, draw_settings, rate_for
 from worldstate.simulation.scene.vehicle import LIGHT, SOURCE_HEIGHT_M, SourceSignal, drive, emit
-from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver, Surroundings, standing_m
+from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.renderers import add_ambience
-from worldstate.simulation.sound.scatter import add_scattered, scattering
-from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.scatter import add_scattered
+from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 FACTOR, ARRAY = 8, ovad_array()
 FEWER = MicrophoneArray(ARRAY.positions_m[::4])
@@ -48,21 +48,20 @@ def vehicle_sound(
 ) -> np.ndarray:
     """Return the sound of one vehicle with these signals at an array by every path, (M, n)."""
     knots = np.arange(-(-samples // KNOT_SAMPLES) + 1) * KNOT_SAMPLES / rate
-    start_s = -BEFORE * KNOT_SAMPLES / LOW_HZ
     receiver = Receiver(standing_m(array), np.zeros(array.n_microphones), knots, settings.ego)
-    emitted = start_s + np.arange(len(sources[0].signal) // KNOT_SAMPLES + 1) * KNOT_SAMPLES / rate
+    out = np.zeros((array.n_microphones, receiver.samples), np.float32)
+    street = StreetSound(StaticSources(out, rate), settings.site, settings.preset, receiver)
+    emitted = -BEFORE * KNOT_SAMPLES / LOW_HZ
+    emitted += np.arange(len(sources[0].signal) // KNOT_SAMPLES + 1) * KNOT_SAMPLES / rate
     (path,) = trajectories(settings, emitted)
-    moving = [
-        MovingSource(Emission.of(one.signal, start_s, rate), *path.behind(one.behind_m), one.height_m)
+    *moving, middle = (
+        street.source(one.signal, emitted, path.behind(one.behind_m), one.height_m)
         for one in [*sources, SourceSignal(sum(s.signal for s in sources), 1.0, SOURCE_HEIGHT_M)]
-    ]
-    preset = settings.preset
-    around = Surroundings(settings.site, receiver, preset.screen_cap_db, scattering(preset), outdoors=True)
-    static = StaticSources(np.zeros((array.n_microphones, receiver.samples), np.float32), rate)
-    add_sources(static, moving[:-1], around)
-    add_scattered(static, moving[-1], around)
-    static.render()
-    return static.out[:, :samples]
+    )
+    add_sources(street, moving)
+    add_scattered(street, middle)
+    street.static.render()
+    return out[:, :samples]
 
 
 def decimated(sound: np.ndarray) -> np.ndarray:

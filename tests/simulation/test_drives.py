@@ -7,6 +7,7 @@ import pytest
 import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulated_sound import rendered, street_of
 
 from worldstate.adapters.acoustic import heard_of
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -14,14 +15,13 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.simulation import preset
-from worldstate.simulation.scene.junction import drawn_site, ego_moves, renderer_named, site
+from worldstate.simulation.scene.junction import SITES, drawn_site, ego_moves, renderer_named, site
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.sound import ego_sound
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
-from worldstate.simulation.sound.receiver import Receiver, passed_places
+from worldstate.simulation.sound.receiver import passed_places
 from worldstate.simulation.sound.renderers import RENDERERS
-from worldstate.simulation.sound.static_field import PlacedSource, StaticSources, StreetSound
 from worldstate.simulation.stream.arrivals import STANDING, VehicleEvent
 from worldstate.simulation.stream.manoeuvres import Driver, emerges
 from worldstate.simulation.stream.rendering import draw_microphones, event_sound, loudness_db
@@ -130,20 +130,16 @@ def test_the_motion_is_the_same_on_every_clock(later_s: float) -> None:
         np.testing.assert_allclose(law(ego.later(later_s), time), law(ego, time + later_s), atol=1e-9)
 
 
-def test_a_place_has_the_same_background_with_a_moving_ego() -> None:
-    assert replace(drive(2).site, name="SA103") == drawn_site("SA103")
-
-
-@given(st.sampled_from("STM"), st.sampled_from("AB"), st.integers(1, 999))
-def test_a_drive_is_at_the_place_of_its_renderer(letter: str, kind: str, number: int) -> None:
-    standing, moving = f"{letter}{kind}{number}", f"D{letter.replace('S', '')}{kind}{number}"
-    assert replace(drawn_site(moving), name=standing) == drawn_site(standing)
+@given(
+    st.builds("{}{}{}".format, st.sampled_from("STM"), st.sampled_from("AB"), st.integers(1, 999))
+    | st.sampled_from(SITES)
+)
+def test_a_drive_is_at_the_place_of_its_renderer(standing: str) -> None:
+    moving = f"D{standing.removeprefix('S')}"
+    for plan in (drawn_site, site) if standing in (*SITES, "TA1", "MB203") else (drawn_site,):
+        assert replace(plan(moving), name=standing) == plan(standing)
     assert renderer_named(moving) == renderer_named(standing)
     assert ego_moves(moving) and not ego_moves(standing)
-
-
-def test_drives_of_different_renderers_have_different_names() -> None:
-    assert replace(site("DMB203"), name="MB203") == site("MB203")
 
 
 # A place takes a second with the second renderer and some hundredths with the third.
@@ -162,15 +158,12 @@ def carried(
     array_x_m: float = 0.0,
 ) -> np.ndarray:
     """Return the sound of a static signal at a pair of microphones on the moving ego."""
-    plan, knots = drawn_site(name), np.arange(len(signal) // KNOT_SAMPLES + 1) * KNOT_SAMPLES / rate_hz
-    positions = PAIR_M + np.array([array_x_m, 0.0, 0.0])
-    static = StaticSources(np.zeros((2, len(signal)), np.float32), rate_hz)
-    street = StreetSound(static, plan, preset(), Receiver(positions, np.zeros(2), knots, ego))
-    x, y = (np.full(len(knots), one) for one in place_m)
-    source = PlacedSource(signal.astype(np.float32), knots, x, y, 0.3)
+    plan, positions = drawn_site(name), PAIR_M + np.array([array_x_m, 0.0, 0.0])
+    street = street_of(plan, positions, len(signal) / rate_hz + 1e-6, rate_hz, ego, preset())
+    x, y = (np.full(len(street.receiver.knots_s), one) for one in place_m)
+    source = street.source(signal.astype(np.float32), street.receiver.knots_s, (x, y))
     RENDERERS[plan.renderer].add_source(street, source, np.random.default_rng(1))
-    static.render()
-    return static.out
+    return rendered(street)
 
 
 def noise(blocks: int, seed: int = 3) -> np.ndarray:

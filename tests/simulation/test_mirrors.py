@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from simulated_sound import PAIR, street_of
 
-from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.simulation.dataset.recording import simulate_recording
 from worldstate.simulation.scene.junction import drawn_site, site
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import SimulationSettings
 from worldstate.simulation.sound import mirrors, renderers
-from worldstate.simulation.sound.delay import KNOT_SAMPLES
+from worldstate.simulation.sound.delay import Emission
 from worldstate.simulation.sound.mirrors import FADE_M, Fronts, add_mirrored, drawn_fronts, trace
-from worldstate.simulation.sound.receiver import Receiver
-from worldstate.simulation.sound.static_field import PlacedSource, StaticSources, StreetSound
+from worldstate.simulation.sound.static_field import PlacedSource
 
 FS = 6000.0
 EAR = np.zeros(2)
@@ -95,16 +94,13 @@ def test_the_direct_path_has_weight_one_only_in_view(plan, y) -> None:
 
 def impulses(plan, place: tuple[float, float], positions: np.ndarray) -> np.ndarray:
     """Return the sound of a click in the middle of half a second at the microphones."""
-    blocks = round(0.5 * FS / KNOT_SAMPLES)
-    click = np.zeros(blocks * KNOT_SAMPLES, np.float32)
+    street = street_of(plan, positions, 0.5, FS, levels=preset())
+    click = np.zeros(street.receiver.samples, np.float32)
     click[len(click) // 2] = 1.0
-    knots = np.arange(blocks + 1) * KNOT_SAMPLES / FS
-    receiver = Receiver(positions, np.zeros(len(positions)), knots)
-    static = StaticSources(np.zeros((len(positions), len(click)), np.float32), FS)
-    source = PlacedSource(click, knots, *(np.full(blocks + 1, one) for one in place), 0.3)
-    street = StreetSound(static, plan, preset(), receiver)
-    add_mirrored(street, source, np.random.default_rng(1))
-    return static.out
+    knots = street.receiver.knots_s
+    x, y = (np.full(len(knots), one) for one in place)
+    add_mirrored(street, street.source(click, knots, (x, y)), np.random.default_rng(1))
+    return street.static.out
 
 
 RING = np.array([[0.2, 0.1, 1.7], [-0.2, 0.15, 1.6], [0.05, -0.2, 1.9], [-0.05, -0.05, 1.6]])
@@ -154,9 +150,13 @@ def test_ambience_and_vehicles_use_one_renderer(name: str, monkeypatch: pytest.M
     towns = []
     monkeypatch.setattr(renderers, "add_town", lambda *arguments: towns.append(arguments[-1]))
     settings = SimulationSettings(site(name), "none", duration_s=0.6, entry_s=0.45)
-    pair = MicrophoneArray(np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]))
-    simulate_recording(settings, np.random.default_rng(1), pair)
+    simulate_recording(settings, np.random.default_rng(1), PAIR)
     assert len(towns) == 1 and towns[0].opened.sum() > 0.0
+
+
+def silent_at(x_m: float, y_m: np.ndarray) -> PlacedSource:
+    time_s = np.arange(len(y_m)) * 0.02
+    return PlacedSource(Emission.of(np.zeros(128, np.float32), 0.0, FS), time_s, 0.0 * y_m + x_m, y_m, 0.3)
 
 
 @given(plans, st.sampled_from([1.0, -1.0]))
@@ -166,11 +166,10 @@ def test_the_level_is_continuous_at_the_edge_of_the_shadow(plan, side) -> None:
     lane, centre = plan.lanes_m[0], np.array([0.0, 0.0, 1.7])
     edge = abs(plan.sight_m(lane)[0 if side < 0 else 1])
     y = side * (edge + np.arange(40.0, -41.0, -1.0) / 10.0)
-    source = PlacedSource(np.zeros(8, np.float32), np.arange(len(y)) * 0.02, np.full(len(y), lane), y, 0.3)
     corner = plan.corner_ahead_m, side * (plan.corner_left_m if side > 0 else plan.corner_right_m)
     straight, total = np.hypot(np.hypot(lane, y), 1.4), np.zeros(len(y))
     bent = np.hypot(np.hypot(*corner) + np.hypot(lane - corner[0], y - corner[1]), 1.4)
-    for way in mirrors.ways_of(plan, source, centre):
+    for way in mirrors.ways_of(plan, silent_at(lane, y), centre):
         length = way.length_m(centre)
         if np.allclose(length, straight) or np.allclose(length, bent):
             total += way.gain[:, 5] / length
@@ -186,10 +185,7 @@ def test_absorbing_walls_leave_direct_and_diffracted_sound(monkeypatch: pytest.M
     monkeypatch.setattr(mirrors, "drawn_fronts", lambda _: Fronts(fronts.ends_m, 0.0 * fronts.kept))
     mirrors.images_at.cache_clear()
     y = np.linspace(-25.0, 25.0, 201)
-    source = PlacedSource(
-        np.zeros(8, np.float32), np.arange(201) * 0.02, np.full(201, plan.lanes_m[0]), y, 0.3
-    )
-    ways = mirrors.ways_of(plan, source, np.array([0.0, 0.0, 1.7]))
+    ways = mirrors.ways_of(plan, silent_at(plan.lanes_m[0], y), np.array([0.0, 0.0, 1.7]))
     mirrors.images_at.cache_clear()
     audible = [way for way in ways if way.gain.any()]
     assert len(ways) > 6 and len(audible) == 3  # straight, round the left corner, round the right one

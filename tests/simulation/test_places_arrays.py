@@ -7,15 +7,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import soundfile
+from simulated_sound import QUIET, apart_deg, made, srp_spectrum
 
 from worldstate.adapters.files.array_file import read_array
-from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.bearing import srp_phat
-from worldstate.simulation import SimulationSettings, place, preset, simulate_recording
+from worldstate.simulation import SimulationSettings, place, simulate_recording
 
-FS, NFFT = 12_000.0, 128
+FS = 12_000.0
 GRID = np.stack(np.meshgrid(*[np.arange(4.0)] * 2), axis=-1).reshape(-1, 2)
 ZERO = np.zeros((16, 1))
 CUBE = np.stack(np.meshgrid(*[np.arange(2.0)] * 3), axis=-1).reshape(-1, 3)
@@ -31,9 +29,7 @@ ARRAYS = {
 }
 FRONT_AS_BACK, LEFT_AS_RIGHT = ("pair", "line across", "upright"), ("line along",)
 AZIMUTHS_DEG = np.arange(-180.0, 180.0, 2.0)
-STILL = {"ambient_octaves_db": (-20.0,) * 8, "wind_100hz_db": -20.0, "self_noise_db": 0.0}
-EXACT = {"gain_mismatch_db": 0.0, "delay_mismatch_s": 0.0, "vehicle_spread_db": 0.0}
-QUIET = replace(preset(), far_rate=0.0, ambient_waves=8, **STILL, **EXACT)
+LEVEL = replace(QUIET, ambient_waves=8, vehicle_spread_db=0.0)
 
 
 @lru_cache
@@ -44,25 +40,9 @@ def passing(azimuth_deg: float, name: str) -> np.ndarray:
     way = ((2.0 * x, 2.0 * y), (x, y))
     scene = SimulationSettings(
         place("open-road").site, "left", 0.5, entry_s=0.3, speed_mps=1.0, sample_rate_hz=FS, route_m=way,
-        preset=QUIET,
+        preset=LEVEL,
     )  # fmt: skip
     return simulate_recording(scene, np.random.default_rng(1), MicrophoneArray(ARRAYS[name])).audio
-
-
-def spectrum(sound: np.ndarray, array: MicrophoneArray) -> np.ndarray:
-    bins = slice(4, 16)
-    steering = Steering.towards(array, np.arange(bins.start, bins.stop) * FS / NFFT, np.radians(AZIMUTHS_DEG))
-    frames = len(sound) // NFFT
-    cut = sound[: frames * NFFT].reshape(frames, NFFT, -1) * np.hanning(NFFT)[:, None]
-    return srp_phat(np.ascontiguousarray(np.fft.rfft(cut, axis=1)[:, bins].astype(np.complex64)), steering)
-
-
-def wrapped(degrees: float) -> float:
-    return (degrees + 180.0) % 360.0 - 180.0
-
-
-def apart_deg(one: float, other: float) -> float:
-    return abs(wrapped(one - other))
 
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
@@ -71,11 +51,9 @@ def test_bearings_are_right_up_to_the_symmetry_of_the_array(name, azimuth_deg):
     array = MicrophoneArray(ARRAYS[name])
     sound = passing(azimuth_deg, name)
     assert sound.shape == (6000, array.n_microphones)
-    power = spectrum(sound, array)
+    power = srp_spectrum(sound.T, array, FS, AZIMUTHS_DEG, (375.0, 1500.0))
     mirrored = 180.0 - azimuth_deg if name in FRONT_AS_BACK else -azimuth_deg
-    here, there = (
-        power[np.argmin([apart_deg(a, at) for a in AZIMUTHS_DEG])] for at in (azimuth_deg, mirrored)
-    )
+    here, there = (power[apart_deg(AZIMUTHS_DEG, at).argmin()] for at in (azimuth_deg, mirrored))
     found = AZIMUTHS_DEG[power.argmax()]
     if name in (*FRONT_AS_BACK, *LEFT_AS_RIGHT):
         assert min(apart_deg(found, azimuth_deg), apart_deg(found, mirrored)) <= 6.0
@@ -92,9 +70,7 @@ def test_the_level_does_not_depend_on_the_array():
 
 def test_the_data_set_keeps_the_array_with_its_heights(tmp_path, capsys):
     (tmp_path / "cube.json").write_text(json.dumps(np.array(ARRAYS["cube"]).tolist()))
-    arguments = ["sim", "make", "--out", str(tmp_path / "d"), "--static", "1", "--duration", "0.5", "--json"]
-    arguments += ["--scene", "parked-van"]
-    assert main([*arguments, "--array", str(tmp_path / "cube.json")]) == 0
-    (folder,) = json.loads(capsys.readouterr().out)["folders"]
+    words = f"--static 1 --duration 0.5 --scene parked-van --array {tmp_path / 'cube.json'}"
+    (folder,) = made(capsys, tmp_path / "d", words)["folders"]
     np.testing.assert_array_equal(read_array(tmp_path / "d" / "array.xml").positions_m, ARRAYS["cube"])
     assert soundfile.info(tmp_path / "d" / folder / "out_multi.wav").channels == 8

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.special
+from simulated_sound import ONE, rendered, street_of
 from worldstate_lab.streets.simulated_windows import RATE_HZ
 
 from worldstate.frontend.array.microphone_array import ovad_array
@@ -27,12 +28,7 @@ from worldstate.simulation.sound.diffraction import SPEED_OF_SOUND_MPS
 from worldstate.simulation.sound.ego_sound import add_ego_echo, echo_gain, echo_lobes, ego_noise
 from worldstate.simulation.sound.receiver import Receiver
 from worldstate.simulation.sound.renderers import add_ambience
-from worldstate.simulation.sound.static_field import (
-    StaticSources,
-    StreetSound,
-    plane_wave_delays,
-    unit_vectors,
-)
+from worldstate.simulation.sound.static_field import plane_wave_delays, unit_vectors
 
 FS = 8000.0
 
@@ -204,14 +200,11 @@ def passing(surface_db: float, bass_db: float) -> np.ndarray:
     """Return levels of one vehicle in the open in the octaves of 125 Hz and 1 kHz."""
     plan = replace(place("merge").site, occluders=(), in_the_open=True, surface_db=surface_db)
     levels = replace(preset(), vehicle_spread_db=0.0, engine_spread_db=0.0, engine_bass_db=bass_db)
-    knots = np.arange(126) * KNOT_SAMPLES / FS
+    street = street_of(plan, ONE, 2.0, FS, levels=levels)
     time = np.arange(-30, 126) * KNOT_SAMPLES / FS
-    heard_pa = StaticSources(np.zeros((1, 125 * KNOT_SAMPLES), np.float32), FS)
-    receiver = Receiver(np.array([[0.0, 0.0, 1.7]]), np.zeros(1), knots)
     path = drive(time, entry_s=1.0, entry_y_m=2.0, lane_x_m=8.0, speed_mps=6.0)
-    add_vehicle(StreetSound(heard_pa, plan, levels, receiver), path, np.random.default_rng(1))
-    heard_pa.render()
-    f, power = scipy.signal.welch(heard_pa.out[0], FS, nperseg=1024)
+    add_vehicle(street, path, np.random.default_rng(1))
+    f, power = scipy.signal.welch(rendered(street)[0], FS, nperseg=1024)
     bands = [power[(f > 0.71 * middle) & (f < 1.41 * middle)].sum() for middle in (125.0, 1000.0)]
     return 10.0 * np.log10(bands)
 

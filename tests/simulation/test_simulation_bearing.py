@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulated_sound import QUIET
 from worldstate_lab.streets.simulated_windows import RATE_HZ, simulated_window_pair
 
 from worldstate.frontend.array.microphone_array import ovad_array
@@ -11,22 +12,10 @@ from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.bearing import srp_phat
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD, feature_nfft
 from worldstate.frontend.spectra.stft import band_bins, bin_frequencies_hz
-from worldstate.simulation import SITES, SimulationSettings, Site, preset, simulate_recording, site
+from worldstate.simulation import SITES, SimulationSettings, Site, simulate_recording, site
 
 AZIMUTHS_RAD, NFFT = np.radians(np.arange(-90.0, 91.0)), feature_nfft(RATE_HZ)
 BAND_HZ = (300.0, 1500.0)
-# Only the vehicle and the corners.
-QUIET = replace(
-    preset(),
-    ambient_octaves_db=(-20.0,) * 8,
-    far_rate=0.0,
-    wind_100hz_db=-20.0,
-    self_noise_db=0.0,
-    delay_mismatch_s=0.0,
-    late_walled_db=-90.0,
-    late_open_db=-90.0,
-    wall_scattering=0.0,
-)
 
 
 def loudest_deg(plan: Site, approach: str, seed: int, levels=QUIET) -> np.ndarray:

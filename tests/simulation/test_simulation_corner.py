@@ -1,22 +1,19 @@
 """Diffraction at a corner and reflections of street walls against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from simulated_sound import QUIET, C, at, carried, source_in, street_of, tone
 
 from worldstate.simulation.scene.driving import entry_y_m
 from worldstate.simulation.scene.junction import SITES, Site, drawn_site, site
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M
-from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
-from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, SPEED_OF_SOUND_MPS, edge_gain
+from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, edge_gain
 from worldstate.simulation.sound.paths import through_mouth, trace_paths
-from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver, Surroundings
-from worldstate.simulation.sound.static_field import StaticSources
-
-C = SPEED_OF_SOUND_MPS
 
 
 @given(letter=st.sampled_from(["SA", "SB", "TA", "TB", "MA", "MB"]), number=st.integers(101, 999_999))
@@ -63,19 +60,15 @@ def test_a_rendered_corner_equals_a_rigid_wedge(y):
     site = Site(
         "Wedge", 2.8, 30.0, 4.45, None, 2.8, 30.0, 6.0, 0.98, side_order=1, right_openings_m=((-99.0, 99.0),)
     )
-    tones, blocks, rate = OCTAVES_HZ.astype(int) + 1, 450, 48_000.0  # whole periods in a second
-    time = np.arange((blocks + 60) * KNOT_SAMPLES) / rate
-    sound = np.cos(2 * np.pi * tones[:, None] * time).sum(axis=0)
-    emission = Emission.of(sound.astype(np.float32), -0.1, rate)
-    still = MovingSource(emission, 6.0, np.full(len(emission.knots_s), y))
-    listener = np.array([[0.0, 0.0, SOURCE_HEIGHT_M]])
-    receiver = Receiver(listener, np.zeros(1), np.arange(blocks + 1) * KNOT_SAMPLES / rate)
-    static = StaticSources(np.zeros((1, blocks * KNOT_SAMPLES), np.float32), rate)
-    add_sources(static, [still], Surroundings(site, receiver, 60.0))
-    static.render()
+    tones, rate = OCTAVES_HZ.astype(int) + 1, 48_000.0  # whole periods in a second
+    levels = replace(QUIET, screen_cap_db=60.0)
+    street = street_of(site, [[0.0, 0.0, SOURCE_HEIGHT_M]], 1.2, rate, levels=levels)
+    heard = carried(
+        street, source_in(street, lambda time: np.sum([tone(f)(time) for f in tones], axis=0), at(6.0, y))
+    )
     r0, r = np.hypot(6.0 - 4.45, y - 2.8), np.hypot(4.45, 2.8)
     wanted = rigid_wedge_db(r, EXTERIOR_RAD - np.arctan2(2.8, 4.45), r0, np.arctan2(6.0 - 4.45, y - 2.8))
-    spectrum = np.abs(np.fft.rfft(static.out[0, 4800 : 4800 + int(rate)])) * 2 / rate
+    spectrum = np.abs(np.fft.rfft(heard[0, 4800 : 4800 + int(rate)])) * 2 / rate
     np.testing.assert_allclose(20 * np.log10(spectrum[tones] * (r + r0)), wanted, atol=1.5)
 
 
@@ -104,11 +97,10 @@ def test_paths_are_straight_in_view_and_bent_when_hidden(corner, beyond, y):
 def test_an_opening_removes_the_reflections_on_it(begin, length, y):
     """A source at (7, y) and a wall at -2.8 m: the reflection point by similar triangles."""
     opening = (begin, begin + length)
-    plan = {"corner_left_m": 12.0, "corner_right_m": 12.0, "corner_ahead_m": 4.0, "opposite_wall_m": None}
-    walls = {"side_wall_left_m": 12.0, "side_wall_right_m": 2.8, "street_width_m": 6.0, "side_order": 1}
-    whole = trace_paths(Site("SB1", **plan, **walls), 7.0, np.array([y]), 1.4, 60.0)
-    holed = trace_paths(
-        Site("SB1", **plan, **walls, right_openings_m=(opening,)), 7.0, np.array([y]), 1.4, 60.0
+    plan = Site("SB1", 12.0, 12.0, 4.0, None, 12.0, 2.8, 6.0, side_order=1)
+    whole, holed = (
+        trace_paths(one, 7.0, np.array([y]), 1.4, 60.0)
+        for one in (plan, replace(plan, right_openings_m=(opening,)))
     )
     aim = min(4.0 / 7.0 * (y + 5.6) - 5.6, 12.0)  # at the mouth
     met = 4.0 * 2.8 / (aim + 5.6)
@@ -130,8 +122,7 @@ def test_images_of_a_hidden_vehicle_follow_one_another(aside, ahead, lane, y):
     site = Site("SB1", aside, aside, ahead, None, aside, aside, 6.0)
     paths = trace_paths(site, ahead + lane, np.array([y]), 0.0, 60.0)
     for order in range(4):
-        offsets = [path.receiver.offset_m for path in paths]
-        path = paths[int(np.argmin(np.abs(np.array(offsets) + 2.0 * order * aside)))]
+        path = min(paths, key=lambda one: abs(one.receiver.offset_m + 2.0 * order * aside))
         assert path.receiver.order == order
         tangent = (2.0 * order * aside + y) / (ahead + lane)
         inside = min(tangent - (2 * order - 1) * aside / ahead, (2 * order + 1) * aside / ahead - tangent)

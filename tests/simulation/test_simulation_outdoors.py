@@ -1,18 +1,16 @@
 """Air, road, kinds of vehicles and routes against tables, closed forms and brute force."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from worldstate.simulation import SimulationSettings, draw_settings, site
+from worldstate.simulation import SimulationSettings, draw_settings
 from worldstate.simulation.scene.driving import trajectories
 from worldstate.simulation.scene.junction import place
-from worldstate.simulation.scene.kinds import KINDS, LIGHT, vehicle_kind
-from worldstate.simulation.scene.occluders import OccludingBody, box, detours, hidden_by
+from worldstate.simulation.scene.kinds import KINDS, vehicle_kind
+from worldstate.simulation.scene.occluders import OccludingBody, detours, hidden_by
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, REFERENCE_PA, octave_masks
 from worldstate.simulation.scene.vehicle import (
     BRAKING_MPS2,
@@ -230,19 +228,10 @@ def test_the_detour_is_continuous_at_line_of_sight(name):
             assert np.abs(np.diff(detour))[near[1:] & near[:-1]].max() < 0.012  # 9 m/s, 1 ms
 
 
-def test_moving_and_static_sites_share_their_geometry():
+def test_a_drive_has_a_drawn_ego_that_stops_after_the_vehicle_appears():
     rng = np.random.default_rng(3)
     for name in ("A1", "B2", "B3"):
-        assert replace(site("D" + name), name="S" + name) == site("S" + name)
         moving = draw_settings("D" + name, "left", rng)
         assert 10.0 / 3.6 <= moving.ego.speed_mps <= 30.0 / 3.6
         assert moving.ego.stop_s > moving.entry_s - 0.5
         assert draw_settings("S" + name, "left", rng).ego.stands
-
-
-def test_thin_bodies_hide_sources():
-    assert box(1.0, 2.0, -1.0, 1.0).corners_m[2] == (2.0, 1.0)
-    assert hidden_by(
-        [OccludingBody(((5.0, -1.0), (5.0, 1.0)))], np.array([9.0]), np.zeros(1), (0.0, 0.0)
-    ).all()
-    assert LIGHT.label == "car"

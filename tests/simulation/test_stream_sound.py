@@ -14,9 +14,9 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import coherence, welch
+from simulated_sound import PAIR, made, refusal
 
 from worldstate.adapters.datasets.ovad import Recording, choose_array, read_true_tracks
-from worldstate.cli.main import main
 from worldstate.commissioning.heard_stream import junction_named
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.typing import Float32Array, FloatArray
@@ -35,16 +35,13 @@ from worldstate.simulation.stream.rendering import (
     draw_microphones,
     event_sound,
     loudness_db,
-    pieces,
     render_blocks,
-    render_piece,
     row_times,
 )
 from worldstate.simulation.stream.settings import StreamSettings, Traffic, traffic_named
 from worldstate.simulation.stream.truth import visible_s
 from worldstate.simulation.stream.writing import draw_stream, write_stream
 
-PAIR = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
 # No source changes its level, so the rest is stationary.
 STILL = replace(preset(), name="still", far_rate=0.0, wave_fluctuation_db=0.0, ambient_waves=8)
 
@@ -205,16 +202,6 @@ def test_pieces_of_background_join_without_a_seam() -> None:
     assert near < 1.2 * jump.max() and near < 8.0 * jump.std() + jump.mean()
 
 
-def test_pieces_do_not_depend_on_the_order_of_rendering() -> None:
-    scene = scene_of(1.0, rate_hz=2000.0)
-    parts = pieces(scene, [event_at(3.0, "parks", 10.0), event_at(33.0, "parks", 10.0)])
-    forth = [render_piece(scene, part).pressure_pa for part in parts]
-    back = [render_piece(scene, part).pressure_pa for part in reversed(parts)]
-    for one, other in zip(forth, reversed(back), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(forth[0][:, :1000], forth[1][:, :1000])
-
-
 @pytest.mark.parametrize("place", ["SB1", "TA101", "DB102"])
 @given(seed=st.integers(0, 10_000), microphones=st.lists(st.integers(1, 5), min_size=2, max_size=2))
 @settings(max_examples=2, deadline=None)
@@ -253,9 +240,8 @@ def test_memory_does_not_grow_with_the_length_of_a_stream() -> None:
 def test_a_stream_on_disk_reads_as_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     positions = tmp_path / "pair.json"
     positions.write_text(json.dumps(PAIR.positions_m.tolist()))
-    command = "sim make --minutes 0.25 --site SB1 --seed 33 --traffic busy --bandwidth 700 --json"
-    assert main([*command.split(), "--array", str(positions), "--out", str(tmp_path)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    words = "--minutes 0.25 --site SB1 --seed 33 --traffic busy --bandwidth 700 --array"
+    told = made(capsys, tmp_path, f"{words} {positions}")
     folder = tmp_path / "SB1-busy-33"
     assert told["out"] == str(folder) and (folder / "stream.png").stat().st_size > 20_000
     recording = Recording.open(folder)
@@ -287,12 +273,9 @@ def test_the_stream_command_offers_all_traffic_and_reports_bad_options(
         "--minutes 1 --bandwidth 3": "--bandwidth",
     }
     for words, problem in refused.items():
-        assert main(["sim", "make", "--out", str(tmp_path), *words.split()]) == 2
-        assert problem in capsys.readouterr().err
+        assert problem in refusal(capsys, tmp_path, words)
     (tmp_path / "SB1-empty-1").mkdir()
-    words = ["--minutes", "1", "--site", "SB1", "--traffic", "empty"]
-    assert main(["sim", "make", "--out", str(tmp_path), *words]) == 2
-    assert "something else" in capsys.readouterr().err
+    assert "something else" in refusal(capsys, tmp_path, "--minutes 1 --site SB1 --traffic empty")
 
 
 @pytest.mark.slow

@@ -29,12 +29,12 @@ from worldstate.operations.training.training import fit_ensemble
 from worldstate.simulation.scene.junction import open_road
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.scene.settings import EGO_SPEEDS_MPS
-from worldstate.simulation.sound.delay import KNOT_SAMPLES, Emission, MovingSource
+from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.ego_sound import ego_noise
 from worldstate.simulation.sound.propagation import add_sources
-from worldstate.simulation.sound.receiver import Receiver, Surroundings, standing_m
+from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.renderers import add_ambience
-from worldstate.simulation.sound.static_field import StaticSources
+from worldstate.simulation.sound.static_field import StaticSources, StreetSound
 
 from .heard_stream import HeardStream
 from .sequence_training import SILENT_KINDS
@@ -259,14 +259,13 @@ def open_feature(
 
 def _add_source(out: Float32Array, source: OpenSource, receiver: Receiver, rng: np.random.Generator) -> None:
     blocks = int((_HEAD_S + _WINDOW_S) * RATE_HZ) // KNOT_SAMPLES + 1
-    emission = Emission.of(_tilted(blocks * KNOT_SAMPLES, rng), -_HEAD_S, RATE_HZ)
-    since = emission.knots_s - 0.5 * _WINDOW_S
+    knots = -_HEAD_S + np.arange(blocks + 1) * KNOT_SAMPLES / RATE_HZ
+    since = knots - 0.5 * _WINDOW_S
     x = source.distance_m * np.cos(source.azimuth_rad) + source.velocity_mps[0] * since
     y = source.distance_m * np.sin(source.azimuth_rad) + source.velocity_mps[1] * since
-    around = Surroundings(open_road().site, receiver, preset().screen_cap_db, outdoors=True)
-    static = StaticSources(out, RATE_HZ)
-    add_sources(static, [MovingSource(emission, x, y)], around)
-    static.render()
+    street = StreetSound(StaticSources(out, RATE_HZ), open_road().site, preset(), receiver)
+    add_sources(street, [street.source(_tilted(blocks * KNOT_SAMPLES, rng), knots, (x, y))])
+    street.static.render()
 
 
 def _tilted(samples: int, rng: np.random.Generator) -> Float32Array:
