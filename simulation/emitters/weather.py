@@ -17,12 +17,7 @@ from worldstate.simulation.sound.background import (
     wind_density,
 )
 from worldstate.simulation.sound.receiver import Receiver
-from worldstate.simulation.sound.static_field import (
-    StaticSources,
-    azimuths_all_round,
-    plane_wave_delays,
-    unit_vectors,
-)
+from worldstate.simulation.sound.static_field import StaticSources, azimuths_all_round, plane_wave_delays
 
 from .emitter import a_weight, a_weighted
 from .signals import add_ringing, bursts, gate, octave_noise
@@ -46,17 +41,22 @@ def add_rain(
     """Add rain to all microphones; its level applies at each of them."""
     rate, samples = receiver.sample_rate_hz, static.out.shape[1]
     level = REFERENCE_PA * 10.0 ** ((sound.what.level_db + sound.level_offset_db) / 20.0)
-    begin = sound.start_s - receiver.knots_s[0]
-    swell = gate(samples, rate, [(begin, begin + sound.duration_s)], SHOWER_RAMP_S).astype(np.float32)
+    swell = _swell(samples, sound, receiver, SHOWER_RAMP_S)
     to_drops, to_street = rng.spawn(2)
     for channel, draws in zip(static.out, to_drops.spawn(len(static.out)), strict=True):
         channel += swell * _drumming(samples, rate, draws) * np.float32(level * np.sqrt(1.0 - FAR_SHARE))
     azimuth = azimuths_all_round(FAR_WAVES, to_street)
     waves = np.stack([octave_noise(FAR_DB, samples, rate, to_street) for _ in azimuth]).astype(np.float32)
     waves *= swell * np.float32(level * np.sqrt(FAR_SHARE / FAR_WAVES) / _hiss_pressure())
-    offsets = receiver.positions_m - receiver.centre_m
     lift = np.abs(to_street.normal(0.0, FAR_LIFT_RAD, FAR_WAVES))
-    static.add(waves, plane_wave_delays(unit_vectors(azimuth, lift), offsets))
+    static.add(waves, plane_wave_delays(azimuth, lift, receiver))
+
+
+def _swell(samples: int, sound: SoundSettings, receiver: Receiver, ramp_s: float) -> Float32Array:
+    """Return the amplitude of a sound over time, which rises and falls within `ramp_s`."""
+    begin = sound.start_s - receiver.knots_s[0]
+    span = (begin, begin + sound.duration_s)
+    return gate(samples, receiver.sample_rate_hz, [span], ramp_s).astype(np.float32)
 
 
 def _drop(rate_hz: float) -> FloatArray:
@@ -121,8 +121,7 @@ def add_wind(
     rate, samples = receiver.sample_rate_hz, static.out.shape[1]
     level_db = sound.what.level_db + sound.level_offset_db
     density = wind_density(level_db, noise_frequencies(samples, rate), ROOF_SLOPE, ROOF_FLOOR_HZ) * rate
-    begin = sound.start_s - receiver.knots_s[0]
-    # The swell rises for half of its duration and falls for the other half.
-    swell = gate(samples, rate, [(begin, begin + sound.duration_s)], sound.duration_s).astype(np.float32)
+    # It rises for half of its duration and falls for the other half.
+    swell = _swell(samples, sound, receiver, sound.duration_s)
     for channel, draws in zip(static.out, rng.spawn(len(static.out)), strict=True):
         channel += swell * shaped_noise(density, samples, draws)

@@ -195,11 +195,10 @@ def site(name: str) -> Site:
     >>> site("SB1").opposite_wall_m is None, site("SA2") == site("SA2")
     (True, True)
     """
-    if ego_moves(name):
-        return replace(site(standing_name(name)), name=name)
-    if not _DRAWN.fullmatch(name):
+    place = standing_name(name)
+    if not _DRAWN.fullmatch(place):
         one_of("site", name, (*SITES, *MOVING_SITES, "TA1", "TB1", "MA1", "MB1"))
-    return PLANS[name] if name in PLANS else drawn_site(name)
+    return replace(PLANS[place], name=name) if place in PLANS else drawn_site(name)
 
 
 # Fitted: a search minimised the difference between expected and mean real patterns (released features), of

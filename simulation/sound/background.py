@@ -5,7 +5,6 @@ all directions. The rest enters by the street's openings: along both arms of the
 corners and by the walls like the sound of a vehicle there, straight ahead, and from behind.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache
 
@@ -20,7 +19,7 @@ from worldstate.simulation.scene.presets import OPENINGS, Ambience, Preset
 
 from .paths import trace_paths
 from .receiver import Receiver
-from .static_field import azimuths_all_round, plane_wave_delays, unit_vectors
+from .static_field import azimuths_all_round, plane_wave_delays
 
 # Length of a block: long compared with the delays across an array (about 3 ms), which are circular within a
 # block, and short compared with the second in which a level changes.
@@ -73,15 +72,7 @@ class WaveField:
     flicker_db: float = 0.0  # Flicker of the whole background; see `Preset`
 
     def add_to(self, out: Float32Array, rng: np.random.Generator) -> None:
-        """Draw the noise and add it to the signals of all microphones, shape (M, n)."""
-        at = 0
-        for heard in self.stretches(rng):
-            room = out[:, at : at + heard.shape[1]]
-            room += heard[:, : room.shape[1]]
-            at += heard.shape[1]
-
-    def stretches(self, rng: np.random.Generator) -> Iterator[Float32Array]:
-        """Draw the noise a few blocks at a time, shape (M, some hops) each, without end."""
+        """Draw the noise, a few blocks at a time, and add it to the signals of all microphones, (M, n)."""
         hop, gains = self.grid.hop, np.sqrt(self.power).astype(np.float32)
         window = np.sin(np.pi * (np.arange(2 * hop) + 0.5) / (2 * hop)).astype(np.float32)
         steering, noise = self._steering(), self._amplitude(self.noise_density)[:, None, None]
@@ -99,8 +90,9 @@ class WaveField:
             whole = np.concatenate([before, blocks])
             heard = np.empty((blocks.shape[1], len(whole) - 1, hop), np.float32)
             np.add(whole[:-1, :, hop:].swapaxes(0, 1), whole[1:, :, :hop].swapaxes(0, 1), out=heard)
+            room = out[:, max(start - 1, 0) * hop :][:, : heard.shape[1] * hop]
+            room += heard.reshape(len(heard), -1)[:, : room.shape[1]]
             before = whole[-1:].copy()
-            yield heard.reshape(len(heard), -1)
 
     def _flicker(self, rng: np.random.Generator) -> Float32Array:
         """Draw the amplitude of every bin in every block, mean power one, shape (F, B)."""
@@ -182,10 +174,9 @@ def add_background(
     grid = BlockGrid(out.shape[1], receiver.sample_rate_hz)
     azimuth = azimuths_all_round(preset.ambient_waves, rng)
     elevation = np.abs(rng.normal(0.0, ELEVATION_RAD, len(azimuth)))
-    directions, offsets = unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m
     field = WaveField(
         grid,
-        plane_wave_delays(directions, offsets) + receiver.skew_s,
+        plane_wave_delays(azimuth, elevation, receiver) + receiver.skew_s,
         level_curve(here.octaves_db, grid.frequencies_hz),
         _Town(site, preset, here, azimuth).power(grid, rng),
         own_noise_density(preset, here, grid.frequencies_hz),
@@ -356,7 +347,7 @@ def add_town(
         power += level * np.exp(-(((time - loudest_s) / rng.uniform(*PASSING_S)) ** 2))[:, None]
     power *= 10.0 ** ((wander + _wander(time, TOWN_S, TOWN_DB, rng)[:, None]) / 10.0)
     noise = own_noise_density(preset, town.here, grid.frequencies_hz)
-    delays = plane_wave_delays(unit_vectors(azimuth, elevation), receiver.positions_m - receiver.centre_m)
+    delays = plane_wave_delays(azimuth, elevation, receiver)
     density = level_curve(octaves, grid.frequencies_hz)
     WaveField(grid, delays + receiver.skew_s, density, power, noise, preset.flicker_db).add_to(out, rng)
 

@@ -33,7 +33,7 @@ from worldstate.simulation.scene.vehicle import (
 from .background import BlockGrid, WaveField, noise_frequencies, shaped_noise, wind_density
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
 from .receiver import Receiver
-from .static_field import StaticSources, azimuths_all_round, plane_wave_delays, unit_vectors
+from .static_field import StaticSources, azimuths_all_round, plane_wave_delays
 
 # Positions in base_link, m: x = 0 at the array, about two metres behind the front bumper; z above the road.
 TYRES_M = np.array([[1.1, 0.75, 0.1], [1.1, -0.75, 0.1], [-1.5, 0.75, 0.1], [-1.5, -0.75, 0.1]])
@@ -137,10 +137,9 @@ def add_ego_echo(
     loudness = power[:, :-1].sum(axis=0) / power[:, -1].sum()
     octaves_db = 10.0 * np.log10(power[:, -1] * echo_gain(site) / REFERENCE_PA**2)
     azimuth = azimuths_all_round(ECHO_WAVES, rng)
-    offsets = receiver.positions_m - receiver.centre_m
     field = WaveField(
         grid,
-        plane_wave_delays(unit_vectors(azimuth, np.zeros(ECHO_WAVES)), offsets) + receiver.skew_s,
+        plane_wave_delays(azimuth, np.zeros(ECHO_WAVES), receiver) + receiver.skew_s,
         level_curve(octaves_db, grid.frequencies_hz),
         loudness[:, None] * echo_lobes(site, azimuth),
         np.zeros(len(grid.frequencies_hz)),

@@ -28,7 +28,7 @@ from .background import Town, direction_numbers
 from .delay import SampledSignal
 from .diffraction import OCTAVE_DB_PER_M, SPEED_OF_SOUND_MPS, corner_gain
 from .receiver import Receiver, add_along, add_to_all, passed_places
-from .static_field import PlacedSource, StreetSound, plane_wave_delays, unit_vectors
+from .static_field import PlacedSource, StreetSound, plane_wave_delays
 
 RAYS, BOUNCES, STEP_M = 100_000, 40, 1.0
 CELL_M, PLAN_M = 2.0, ((-40.0, 40.0), (-90.0, 90.0))  # x and y limits of the stored plan
@@ -290,9 +290,8 @@ def add_traced(street: StreetSound, source: PlacedSource, rng: np.random.Generat
             if way.early < 1.0:
                 table = _smeared(table, way.early, way.decay_s, rng)
             add_along(wave, table, emission.knots_s[span], length[span] + way.later_m, receiver.knots_s)
-    directions = unit_vectors(*np.array([(way.azimuth_rad, way.elevation_rad) for way in ways]).T)
-    delays = plane_wave_delays(directions, receiver.positions_m - receiver.centre_m)
-    static.add(waves, delays + receiver.skew_s)
+    azimuth, elevation = np.array([(way.azimuth_rad, way.elevation_rad) for way in ways]).T
+    static.add(waves, plane_wave_delays(azimuth, elevation, receiver) + receiver.skew_s)
     straight = np.repeat(lit[:, None], len(OCTAVES_HZ), axis=1)
     add_to_all(static.out, emission, straight, lambda place: source.straight_m(place, receiver)[0], receiver)
 

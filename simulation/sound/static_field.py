@@ -29,23 +29,19 @@ BLOCKS_AT_ONCE = 16
 PENDING = 160  # Number of sources that are collected before they are rendered together
 
 
-def plane_wave_delays(directions: FloatArray, offsets_m: FloatArray) -> FloatArray:
+def plane_wave_delays(azimuth_rad: FloatArray, elevation_rad: FloatArray, receiver: Receiver) -> FloatArray:
     """Return the delay of plane waves at every microphone relative to the centre, shape (Q, M), s.
 
-    Shapes: directions (Q, 3), offsets_m (M, 3).
+    Shapes: azimuth_rad, elevation_rad (Q,).
     """
-    return -(directions @ offsets_m.T) / SPEED_OF_SOUND_MPS
+    flat = np.cos(elevation_rad)
+    directions = np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation_rad)], 1)
+    return -(directions @ (receiver.positions_m - receiver.centre_m).T) / SPEED_OF_SOUND_MPS
 
 
 def azimuths_all_round(count: int, rng: np.random.Generator) -> FloatArray:
     """Draw evenly spaced azimuths with a random start."""
     return np.asarray(2.0 * np.pi * (np.arange(count) + rng.random()) / count)
-
-
-def unit_vectors(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
-    """Return unit vectors in `base_link`, shape (Q, 3)."""
-    flat = np.cos(elevation_rad)
-    return np.stack([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,15 +119,15 @@ WAVES_AT_ONCE = 4
 TAIL_DECAYS = 1.0  # Length of a tail in reverberation times (60 dB)
 
 
-def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]:
-    """Return the directions from which late sound reaches the array in a street, and their energy shares.
+def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return azimuths and elevations from which late sound reaches the array, and their energy shares.
 
     Examples
     --------
     >>> from worldstate.simulation.scene.junction import site
-    >>> directions, shares = street_field(site("SA1"), 0.5)
-    >>> directions.shape, round(float(shares.sum()), 6)
-    ((48, 3), 1.0)
+    >>> azimuth_rad, elevation_rad, shares = street_field(site("SA1"), 0.5)
+    >>> len(azimuth_rad), round(float(shares.sum()), 6)
+    (48, 1.0)
     """
     # Between walls and under an open sky late sound arrives near the horizon. It enters by the mouth and from
     # objects there, so that each site has its own late directions ahead.
@@ -141,7 +137,7 @@ def street_field(site: Site, lobe_share: float) -> tuple[FloatArray, FloatArray]
     centres, weights = rng.uniform(-LOBE_SPAN_RAD, LOBE_SPAN_RAD, LOBES), rng.dirichlet(np.full(LOBES, 3.0))
     lobes = np.exp(LOBE_CONCENTRATION * (np.cos(azimuth[:, None] - centres) - 1.0))
     shares = lobe_share * (lobes / lobes.sum(axis=0)) @ weights + (1.0 - lobe_share) / DIRECTIONS
-    return unit_vectors(azimuth, elevation), shares
+    return azimuth, elevation, shares
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,8 +194,8 @@ def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Gener
 
     Shapes: dry (pre + samples,).
     """
-    static, positions_m = street.static, street.receiver.positions_m
-    directions, shares = street_field(street.site, street.preset.late_lobe_share)
+    static = street.static
+    azimuth, elevation, shares = street_field(street.site, street.preset.late_lobe_share)
     samples = static.out.shape[1]
     tail = max(int(TAIL_DECAYS * street.preset.late_decay_s * static.sample_rate_hz), 1)
     n = next_fast_len(len(dry) + tail, real=True)
@@ -215,7 +211,7 @@ def _add_late_field(street: StreetSound, dry: Float32Array, rng: np.random.Gener
         tails = rfft(responses, n)
         tails *= spectrum
         waves[some] = irfft(tails, n)[:, len(dry) - samples : len(dry)]
-    static.add(waves, plane_wave_delays(directions, positions_m - positions_m.mean(axis=0)))
+    static.add(waves, plane_wave_delays(azimuth, elevation, street.receiver))
 
 
 def add_late_sound(
