@@ -1,44 +1,37 @@
-"""Processing time of a hop, stage by stage, in the real front-end and evidence, and that of peers.
+"""Processing time of a hop, stage by stage, in front-end and listener, and that of the published chain.
 
 Every stage is timed in place: its function is wrapped with a clock, so that the chain is not repeated here.
-The window model is the shipped one. Trees and guard are random, with the sizes that `worldstate model make`
-trains, because their time does not depend on the training. `published_chain` implements the published
-acoustic baseline in its amortised form. It computes scipy's STFT of the whole file, channel by channel, and
-its time is shared among the hops. For every hop it then computes two segments of half a second by
-pyroomacoustics' SRP with thirty azimuths, 50-1500 Hz.
+`published_chain_times` implements the published acoustic baseline in its amortised form. It computes scipy's
+STFT of the whole file, channel by channel, and its time is shared among the hops. For every hop it then
+computes two segments of half a second by pyroomacoustics' SRP with thirty azimuths, 50-1500 Hz.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial, wraps
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from worldstate import Measurement, Present, Sighting, SignatureEvidence, WorldFilter
 from worldstate.abduction.road_users import DomainGuard
-from worldstate.abduction.sequence.sequence_inputs import INPUTS
-from worldstate.abduction.sequence.sequence_model import GROUPS, BoostedTrees, SequenceModel
-from worldstate.abduction.sequence.sequence_reader import LEAST_HOPS, SequenceReader
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters import acoustic
-from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.files.model_file import read_model
-from worldstate.commissioning.sequence_training import STANDING
 from worldstate.frontend import hop_spectra, stream
 from worldstate.frontend.approach.tone import ToneStage
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.hop_spectra import LevelMeter
-from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.frontend.spectra.stft import StreamingStft
-from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.typing import Float32Array
+from worldstate.ground.values import NotUsable
 
 Milliseconds = list[float]
 Stages = Mapping[str, tuple[tuple[Any, str], ...]]
+Calls = Sequence[Callable[[], object]]
 
 RATE_HZ, NFFT = 47_998, 512
 FRONT_END: Stages = {
@@ -57,7 +50,6 @@ EVIDENCE: Stages = {
     "domain_guard": ((DomainGuard, "judge"),),
     "sequence_reader": ((acoustic, "read_hop"),),
 }
-"""Parts of `evidence`, which also includes the (empty) camera query and the weighting by bearing."""
 
 
 def elapsed_ms(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
@@ -73,7 +65,7 @@ def elapsed_ms(call: Callable[[], object], clock: Callable[[], float] = time.per
     return 1e3 * (clock() - start)
 
 
-def stage_times(stages: Stages, calls: Sequence[Callable[[], object]]) -> dict[str, Milliseconds]:
+def stage_times(stages: Stages, calls: Calls) -> dict[str, Milliseconds]:
     """Return the time of every stage within each call, in milliseconds.
 
     Examples
@@ -81,36 +73,28 @@ def stage_times(stages: Stages, calls: Sequence[Callable[[], object]]) -> dict[s
     >>> len(stage_times({"power": ((np, "square"),)}, [lambda: np.square(2.0)] * 3)["power"])
     3
     """
-    spent = dict.fromkeys(stages, 0.0)
-    times: dict[str, Milliseconds] = {name: [] for name in stages}
-    with _clocks(stages, spent):
-        for call in calls:
-            spent.update(dict.fromkeys(stages, 0.0))
-            call()
-            for name, ms in spent.items():
-                times[name].append(ms)
-    return times
-
-
-@contextmanager
-def _clocks(stages: Stages, spent: dict[str, float]) -> Iterator[None]:
-    """Make every stage add its milliseconds to `spent`."""
+    times = {name: Milliseconds() for name in stages}
     with ExitStack() as patches:
         for name, functions in stages.items():
             for owner, function in functions:
-                clocked = _clocked(getattr(owner, function), name, spent)
+                clocked = _clocked(getattr(owner, function), times[name])
                 patches.enter_context(patch.object(owner, function, clocked))
-        yield
+        for call in calls:
+            for spent in times.values():
+                spent.append(0.0)
+            call()
+    return times
 
 
-def _clocked(stage: Callable[..., Any], name: str, spent: dict[str, float]) -> Callable[..., Any]:
+def _clocked(stage: Callable[..., Any], spent: Milliseconds) -> Callable[..., Any]:
+    """Return a function that adds its milliseconds to the last entry of `spent`."""
+
     @wraps(stage)
     def call(*arguments: Any, **options: Any) -> Any:
         start = time.perf_counter()
-        try:
-            return stage(*arguments, **options)
-        finally:
-            spent[name] += 1e3 * (time.perf_counter() - start)
+        found = stage(*arguments, **options)
+        spent[-1] += 1e3 * (time.perf_counter() - start)
+        return found
 
     return call
 
@@ -139,97 +123,39 @@ def published_chain_times(sound: Float32Array, array: MicrophoneArray) -> Millis
     return [elapsed_ms(one_hop) + shared_ms for _ in range(REPEATS)]
 
 
-_FOREIGN, _SIGNALS = 9, 4
-_ROWS, _WINDOWS = 150, 40  # Few rows are enough: the peers' time does not depend on them either
+VEHICLES = 1, 20
+HOPS, WARM_UP = 40, 20  # Timed hops, and hops before them until tracks are established
 
 
-def evidence_times(frames: Sequence[AcousticFrame]) -> dict[str, Milliseconds]:
-    """Time the evidence and its parts on every frame, and two peers."""
-    # A thread limit applies only to loaded libraries. On a busy machine, two threads would wait for one
-    # another at each of 900 small trees, for minutes.
-    import sklearn.ensemble  # noqa: F401
-
-    with threadpool_limits(1):
-        rng = np.random.default_rng(1)
-        trees, rows = _peer_trees(rng), rng.normal(size=(REPEATS, 2, len(INPUTS)))
-        whole, interpret = [elapsed_ms(one) for one in _interpreted(frames, rng)], _interpreted(frames, rng)
-        times = stage_times(EVIDENCE, interpret) | {"evidence": whole}
-        # Before these hops the trees are not evaluated.
-        times = {name: spent[LEAST_HOPS:] for name, spent in times.items()}
-        classify, window = _peer_classifier(rng).decision_function, frames[-1].feature[None]
-        times["scikit_learn_trees"] = [elapsed_ms(partial(trees.predict_proba, two)) for two in rows]
-        times["scikit_learn_classifier"] = [elapsed_ms(partial(classify, window)) for _ in rows]
+def update_times(rng: np.random.Generator) -> dict[str, Milliseconds]:
+    """Return the milliseconds of the filter's updates and snapshots, by number of vehicles."""
+    times = dict[str, Milliseconds]()
+    for n in VEHICLES:
+        world, updates, states = WorldFilter(), Milliseconds(), Milliseconds()
+        for one in vehicle_hops(n, rng):
+            start = time.process_time()
+            world = world.update(one)
+            updates.append(1e3 * (time.process_time() - start))
+            states.append(elapsed_ms(partial(getattr, world, "state"), time.process_time))
+        times[f"update_{n}"], times[f"state_{n}"] = updates[WARM_UP:], states[WARM_UP:]
     return times
 
 
-def _interpreted(frames: Sequence[AcousticFrame], rng: np.random.Generator) -> list[Callable[[], object]]:
-    interpret = made_up_adapter(rng).interpret
-    return [partial(interpret, frame) for frame in frames]
-
-
-def made_up_adapter(rng: np.random.Generator) -> AcousticAdapter:
-    """Return an adapter with the shipped window model, random trees and a random guard."""
-    signature = SiteSignature(read_model().signature)  # type: ignore[arg-type]
-    reader = SequenceReader(_sequence(rng))
-    return AcousticAdapter(
-        roof_array_56(), RATE_HZ, signature, guard=_guard(rng), sequence=reader, uncalibrated=True
-    )
-
-
-# The number of trees is that of a model for a standing ego, and each has the size of its largest tree.
-_ROUNDS, _LEAVES = sum(one.rounds for one in STANDING), max(one.leaves for one in STANDING)
-
-
-def _sequence(rng: np.random.Generator) -> SequenceModel:
-    """Grow trees leaf by leaf as in boosting: the deepest path determines the time."""
-    # A round has one tree per group.
-    trees, nodes = _ROUNDS * len(GROUPS), 2 * _LEAVES - 1
-    yes, no = np.tile(np.arange(nodes), (2, trees, 1))
-    for tree in range(trees):
-        leaves = [0]
-        for child in range(1, nodes, 2):
-            node = leaves.pop(int(rng.integers(len(leaves))))
-            yes[tree, node], no[tree, node] = child, child + 1
-            leaves += [child, child + 1]
-    split = rng.integers(len(INPUTS), size=yes.shape)
-    threshold, value = rng.normal(size=(2, *yes.shape))
-    classes = np.arange(trees) % len(GROUPS)
-    grown = BoostedTrees(split, threshold, yes, no, value, classes, np.zeros(len(GROUPS)))
-    return SequenceModel(grown, np.full(len(GROUPS), 1.0 / len(GROUPS)))
-
-
-def _peer_trees(rng: np.random.Generator) -> Any:
-    from sklearn.ensemble import HistGradientBoostingClassifier
-
-    machine = HistGradientBoostingClassifier(
-        max_iter=_ROUNDS,
-        max_leaf_nodes=_LEAVES,
-        min_samples_leaf=2,
-        early_stopping=False,
-        random_state=0,
-    )
-    return machine.fit(rng.normal(size=(_ROWS, len(INPUTS))), np.arange(_ROWS) % len(GROUPS))
-
-
-def _peer_classifier(rng: np.random.Generator) -> Any:
-    """Return the published pipeline: standardisation, then linear machines for all pairs."""
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import SVC
-
-    pipeline = make_pipeline(StandardScaler(), SVC(kernel="linear", decision_function_shape="ovo"))
-    return pipeline.fit(rng.normal(size=(_WINDOWS, 60)), np.arange(_WINDOWS) % 4)
-
-
-def _guard(rng: np.random.Generator) -> DomainGuard:
-    inputs = len(MEASURES)
-    classes = 1 + _FOREIGN + _SIGNALS
-    return DomainGuard(
-        measures=MEASURES,
-        foreign=tuple(f"foreign {i}" for i in range(_FOREIGN)),
-        signals=tuple(f"signal {i}" for i in range(_SIGNALS)),
-        weights=0.01 * rng.normal(size=(classes, inputs)),
-        biases=np.zeros(classes),
-        # Every hop gets the closer analysis, which is the most expensive case.
-        threshold=-1e3,
-    )
+def vehicle_hops(n: int, rng: np.random.Generator) -> list[Measurement]:
+    """Return hops in which a camera detects the same n vehicles, side by side."""
+    stand = np.linspace(-0.5, 0.5, n) if n > 1 else np.zeros(1)
+    # The deviation falls with the number of vehicles, so that neighbouring boxes remain distinguishable.
+    std = min(0.02, 0.2 / n)
+    azimuth_rad = stand + rng.normal(0.0, 0.25 * std, (HOPS, n))
+    silent, even = NotUsable("not measured"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
+    return [
+        Measurement(
+            100_000_000 * hop,
+            even,
+            Present(0.06, 0.01),
+            silent,
+            silent,
+            tuple(Sighting(one, std, "car", 0.9, 0.03) for one in row),
+        )
+        for hop, row in enumerate(azimuth_rad.tolist(), 1)
+    ]

@@ -47,7 +47,6 @@ BENCHES = {
     "bench": f"{BENCH}.cost",
     "bench cost": f"{BENCH}.cost",
     "bench gospa": f"{BENCH}.gospa",
-    "bench import": f"{BENCH}.imports",
 }
 DESCRIPTION = "The evaluation of the paper, and further studies."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"

@@ -34,10 +34,10 @@ from worldstate.state import WorldState
 from worldstate_lab.methods.oc_sort import OcSort
 from worldstate_lab.metrics.track_measures import gospa_bearing
 from worldstate_lab.passes.followed_stream import stream_detections, stream_measurements
+from worldstate_lab.report.table import Cell, Table, Value
 
-SILENCE, WORLD, BOXES, UNHEARING = "silence", "world-state", "boxes as they are", "world-state without sound"
+SILENCE, WORLD, UNHEARING = "silence", "world-state", "world-state without sound"
 OC_SORT, GM_PHD, JPDA = "OC-SORT on the boxes", "GM-PHD (Stone Soup)", "JPDA (Stone Soup)"
-GM_PHD_ENDS = "GM-PHD, born at the view's ends"
 PHASES, PARTS = ("hidden", "visible"), ("localised", "missed", "false")
 EXISTS, ALPHA = 0.5, 0.02
 Row = dict[str, float | None]
@@ -51,27 +51,23 @@ def stated(
 ) -> Iterator[tuple[int, Said]]:
     """Yield the number of every hop of a stream, in tenths of a second, and the output of every method."""
     # Optional: this benchmark alone needs Stone Soup.
-    from worldstate_lab.benchmarks.tracker_costs import GmPhd, Jpda, scan_time, scans
+    from worldstate_lab.benchmarks.stone_soup_trackers import GmPhd, Jpda, scan_time, scans
 
     taken = list(measured)
     view, boxes = _view(taken), _oc_sort(heard)
-    world, deaf, jpda = start, start, Jpda()
-    phds = {GM_PHD: GmPhd(), GM_PHD_ENDS: GmPhd(view)}
+    world, deaf, phd, jpda = start, start, GmPhd(), Jpda()
     for one in taken:
         world, deaf = world.update(one), deaf.update(_unheard(one))
         both, when, hop = scans(one, view), scan_time(one), round(one.stamp_ns * 1e-9 / HOP_S)
-        yield (
-            hop,
-            {
-                SILENCE: ((), ()),
-                WORLD: _by_phase(world.state),
-                BOXES: ((), [box.azimuth_rad for box in one.sightings]),
-                UNHEARING: _by_phase(deaf.state),
-                OC_SORT: ((), boxes[hop]),
-                **{name: _by_place(phd.step(both, when), view) for name, phd in phds.items()},
-                JPDA: _by_place(jpda.step(both, when), view),
-            },
-        )
+        said: Said = {
+            SILENCE: ((), ()),
+            WORLD: _by_phase(world.state),
+            UNHEARING: _by_phase(deaf.state),
+            OC_SORT: ((), boxes[hop]),
+            GM_PHD: _by_place(phd.step(both, when), view),
+            JPDA: _by_place(jpda.step(both, when), view),
+        }
+        yield hop, said
 
 
 def _view(measured: Sequence[Measurement]) -> tuple[float, float]:
@@ -189,14 +185,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the benchmark; return its result."""
     found = report_of(arguments.streams, read_model(arguments.model), arguments.seconds)
-    junctions, lines = [name for name in found if name != "all"], []
-    for k, phase in enumerate(PHASES):
-        parts = "".join(f"{part:>12}" for part in PARTS)
-        lines.append(f"{phase:32}{'GOSPA':>8}{parts}  of {(SILENCE, OC_SORT)[k]}, worst")
-        for method, rows in found["all"].items():
-            row, shares = rows[phase], {one: found[one][method][phase]["share"] or 0.0 for one in junctions}
-            worst = max(shares, key=lambda one: shares[one])
-            parts = "".join(f"{row[part]:12.2f}" for part in PARTS)
-            share = f"  {row['share']:.3f}  {shares[worst]:.3f} ({worst})"
-            lines.append(f"{method:32}{row['gospa_deg']:8.2f}{parts}{share}")
+    junctions, lines = [name for name in found if name != "all"], list[str]()
+    for phase, reference in zip(PHASES, (SILENCE, OC_SORT), strict=True):
+        rows: list[tuple[Cell, ...]] = []
+        for method, by_phase in found["all"].items():
+            shares = {one: found[one][method][phase]["share"] or 0.0 for one in junctions}
+            worst = max(shares, key=shares.__getitem__)
+            rows.append((method, *by_phase[phase].values(), Value(shares[worst], digits=3, note=worst)))
+        heads = (phase, *PARTS, "GOSPA", f"of {reference}", "worst")
+        lines += Table("gospa", "", heads, rows).lines()
     return CommandResult(found, table={}, lines=lines)
