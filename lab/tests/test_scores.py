@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from sklearn.metrics import brier_score_loss, roc_auc_score
 from worldstate_lab.evaluation.scores import BASELINE, DETECTED, OURS, Score, equal_detection, paired
 from worldstate_lab.metrics.intervals import calibration_error_sampling, stratified_draws
-from worldstate_lab.metrics.track_measures import gating_curve
+from worldstate_lab.metrics.track_measures import gated_median_deg
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
 from worldstate.abduction.cueing.risk_map import (
@@ -127,8 +127,8 @@ def test_figures_of_windows_are_those_of_other_formulas():
     ]
     error, prominence = map(np.concatenate, zip(*pairs, strict=True))
     assert figures["bearing_deg"] == pytest.approx(np.degrees(np.median(np.abs(error))))
-    gated = gating_curve(prominence, error).at_coverage(0.16)[1]
-    assert figures["bearing_gated_deg"] == pytest.approx(np.degrees(gated))
+    checks = HopTable({"prominence": prominence, "error_rad": error})
+    assert figures["bearing_gated_deg"] == pytest.approx(gated_median_deg(checks))
 
 
 def test_gospa_of_a_late_track_is_its_misses_and_its_errors():

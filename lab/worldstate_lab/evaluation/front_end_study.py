@@ -38,7 +38,6 @@ class FrontEndStudy:
     by_site: Mapping[str, SiteError]
     frames: int  # Line-of-sight frames with a moving reference box
     approaches: int
-    checked: HopTable  # `prominence` and `error_rad` of every hop, for the gating curve
 
 
 def front_end_study(trials: Sequence[Trial], rng: np.random.Generator, draws: int = 500) -> FrontEndStudy:
@@ -53,14 +52,12 @@ def front_end_study(trials: Sequence[Trial], rng: np.random.Generator, draws: in
         for site in sorted({trial.site for trial in approaches})
     }
     by_site = {site: error for site, error in by_site.items() if error.frames}
-    checked = [_checked(trial.hops) for trial in approaches]
     return FrontEndStudy(
         found,
         {name: middle(np.array([one[name] for one in samples])) for name in found},
         by_site,
         sum(error.frames for error in by_site.values()),
         len(approaches),
-        joined(checked) if checked else HopTable({"prominence": np.empty(0), "error_rad": np.empty(0)}),
     )
 
 

@@ -36,7 +36,7 @@ from worldstate.ground.parallel import in_processes
 from worldstate.operations.figure_style import figure_file
 from worldstate_lab.degradation.beta_curves import BetaCurves
 from worldstate_lab.degradation.conditions import FAMILIES, at_level
-from worldstate_lab.evaluation.report.recording_panels import approach_figure, approach_images
+from worldstate_lab.evaluation.report.approach_panel import approach_figure, approach_images
 from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.report.table import Cell, Table, Value, plain
 from worldstate_lab.sequences.hearing import heard, ovad_chain

@@ -2,7 +2,7 @@
 
 import platform
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,18 +12,16 @@ import sklearn
 from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
-from worldstate_lab.evaluation.protocols import FIXED, GROUNDED, PROTOCOLS, RETRAINED, STANDING, Protocol
-from worldstate_lab.report.table import Cell, Document, Figure, Section, Table, Value
+from worldstate_lab.evaluation.protocols import GROUNDED, PROTOCOLS, STANDING, Protocol
+from worldstate_lab.report.table import Cell, Document, Section, Table, Value
 from worldstate_lab.trials.pass_cache import data_fingerprint
 
 from .degradation_section import awareness_figures, degradation_section, sweep_values
 from .measured_values import PROPOSED, MeasuredValues, printed, site_values
-from .recording_panels import approach_section, bearing_gating_figure, junction_figure
 from .warning_sections import (
     budget_section,
     cueing_section,
     difference_section,
-    strata_section,
     table_i,
     tracking_section,
 )
@@ -48,16 +46,6 @@ _ABLATED = ("detection", "random_detection", "lead_s", "false_alarms_per_hour", 
 _NAMED_BY_ROW = ("array bounds", "signature study", "data", "real time")
 
 
-def _group_table(name: str, title: str, measured: MeasuredValues, group: str, caption: str) -> Table:
-    """Return the paper's values of a group beside ours, one per row."""
-    rows = [
-        (_label(one), _ours(one, measured), printed(one), one.unit)
-        for one in PAPER_VALUES
-        if one.group == group and one.basis != "stated"
-    ]
-    return Table(name, title, ("figure", "here", "paper", "unit"), rows, caption)
-
-
 def _label(one: PaperValue) -> str:
     """Return condition and figure as a label."""
     if one.group in _NAMED_BY_ROW:
@@ -72,25 +60,10 @@ def _ours(one: PaperValue, measured: MeasuredValues) -> Value:
 
 
 def front_end_section(measured: MeasuredValues) -> Section:
-    """Return the section on bearing errors against the camera and bounds of the array."""
-    array = _group_table(
-        "array",
-        "What the 56-microphone array allows",
-        measured,
-        "array bounds",
-        "Computed from the positions of the microphones; no sound is needed.",
-    )
-    bounds, study = Section("Bounds of the array", (), (array,)), measured.found.front_end
+    """Return the section on bearing errors against the camera by junction."""
+    study = measured.found.front_end
     if study is None:
-        return Section("Front-end accuracy", ("No recording has a camera reference.",), (), (bounds,))
-    bearings = _group_table(
-        "front_end",
-        "Bearings in view, and prominence",
-        measured,
-        "front-end",
-        "SRP-PHAT bearing against the nearest moving box of the camera, hops after T0; MUSIC on the same "
-        "hops; gated: the 16 % of the bearings with the highest prominence.",
-    )
+        return Section("Front-end accuracy", ("No recording has a camera reference.",))
     sites = Table(
         "bearing_by_junction",
         "Bearing error by junction",
@@ -99,24 +72,10 @@ def front_end_section(measured: MeasuredValues) -> Section:
             (site, Value(one.median_deg, *one.interval_deg, digits=1), str(one.frames))
             for site, one in study.by_site.items()
         ],
-        "The paper's medians of junctions lie between 2.5 and 5.8 degrees.",
+        "SRP-PHAT bearing against the nearest moving box of the camera, hops after T0. The paper's medians "
+        "lie between 2.5 and 5.8 degrees.",
     )
-    blocks = (bearings, sites, bearing_gating_figure(study.checked))
-    return Section("Front-end accuracy", (), blocks, (bounds,))
-
-
-def approach_rate_section(measured: MeasuredValues) -> Section:
-    """Return the section on looming and tonal Doppler."""
-    table = _group_table(
-        "approach_rate",
-        "Approach rate in the wild",
-        measured,
-        "approach rate",
-        "Looming AUROC: energy slope of the last 3 s before the pass against hazard-free sound. "
-        "Correlation: between the time to arrival computed from the slope and the true time until the pass. "
-        "Doppler: number of approaches with a usable tone.",
-    )
-    return Section("Approach rate", (), (table,))
+    return Section("Front-end accuracy", (), (sites,))
 
 
 def transfer_section(measured: MeasuredValues) -> Section:
@@ -128,37 +87,15 @@ def transfer_section(measured: MeasuredValues) -> Section:
             methods, title = measured.methods(name), run.protocol.title
             table = measured.table(name, methods, _TRANSFER, f"protocol_{name}", title, told)
             parts.append(Section(title, (), (table,)))
-    return Section("Generalisation", (), (), (*parts, _junctions(measured.found)))
+    return Section("Generalisation", (), (_junction_table(measured.found),), tuple(parts))
 
 
-def _junctions(found: Evaluation) -> Section:
+def _junction_table(found: Evaluation) -> Table:
     """Return the results of the proposed method at every junction, by protocol."""
-    sites = {name: site_values(scores[PROPOSED], found, name) for name, scores in found.scores.items()}
-    standing = [name for name in (STANDING, FIXED.name, RETRAINED.name) if name in sites]
-
-    def drawn(figure: str, name: str, title: str) -> Figure:
-        by_protocol = {
-            found.runs[protocol].protocol.title: {
-                site: one[figure] for site, one in sites[protocol].items() if figure in one
-            }
-            for protocol in standing
-        }
-        kind = FIGURES[figure]
-        return junction_figure(name, title, kind.title, by_protocol, "low" if kind.worse == "low" else "high")
-
-    figures = (
-        drawn("detection", "junction_detection", "Detection by junction"),
-        drawn("false_alarms_per_hour", "junction_false_alarms", "False alarms by junction"),
-    )
-    return Section("By junction", (), (*figures, _junction_table(found, sites)))
-
-
-def _junction_table(found: Evaluation, sites: Mapping[str, Mapping[str, Mapping[str, Value]]]) -> Table:
     rows: list[tuple[Cell, ...]] = []
-    for name, by_site in sites.items():
-        run = found.runs[name]
+    for name, run in found.runs.items():
         counts = Counter(trial.site for trial in run.trials)
-        for site, one in by_site.items():
+        for site, one in site_values(found.scores[name][PROPOSED], found, name).items():
             rows.append((run.protocol.title, site, str(counts[site]), *map(one.get, _BY_SITE)))
     return Table(
         "junctions",
@@ -249,12 +186,11 @@ def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, st
     sections = [
         _data_section(found),
         *((table_i(measured), budget_section(measured)) if static else ()),
-        *((cueing_section(measured, panels), approach_section(found)) if static else ()),
+        *((cueing_section(measured, panels),) if static else ()),
         front_end_section(measured),
-        approach_rate_section(measured),
         transfer_section(measured),
         degradation_section(found.degradation, found.lacking.get("degradation sweep", "not requested")),
-        *(section(measured) for section in (ablation_section, tracking_section, strata_section) if static),
+        *(section(measured) for section in (ablation_section, tracking_section) if static),
         difference_section(found),
         paper_section(measured),
     ]

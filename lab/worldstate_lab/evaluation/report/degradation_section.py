@@ -13,7 +13,7 @@ from worldstate_lab.evaluation.figures import COMMANDS, paper_value
 from worldstate_lab.report.table import Cell, Figure, Section, Table, Value, plain
 
 from .measured_values import Place
-from .recording_panels import awareness_figure, miss_rate_angle_figure, miss_rate_level_figure
+from .panels import awareness_figure
 
 _RATES, _AWARE = "miss rate of the camera", "after line-of-sight entry"
 _CONDITION = (
@@ -54,7 +54,8 @@ def awareness_figures(study: DegradationStudy) -> tuple[Figure, ...]:
             if name != OFF
         }
         figure = awareness_figure(families, paper.value if paper else math.nan)
-        figures.append(_of_detector(figure, sweep, number))
+        title = f"{figure.title}, {sweep.detector}"
+        figures.append(replace(figure, name=f"{figure.name}_{number}", title=title))
     return tuple(figures)
 
 
@@ -79,8 +80,7 @@ def degradation_section(study: DegradationStudy | None, lacking: str) -> Section
             "Between the first and the last detector, awareness differs by at most "
             f"{study.largest_awareness_difference:.3f}, and beta by {study.beta_shift:+.3f} on average."
         )
-    parts = tuple(_detector_section(sweep, number) for number, sweep in enumerate(study.sweeps, start=1))
-    return Section(title, tuple(text), subsections=parts)
+    return Section(title, tuple(text), tuple(sweep_tables(study)))
 
 
 def sweep_tables(study: DegradationStudy) -> list[Table]:
@@ -111,26 +111,6 @@ def _sweep_record(sweep: DetectorSweep) -> dict[str, object]:
         "least_vision": sweep.least_vision.vision,
         "beta": {"families": FAMILIES, "levels": LEVELS, **asdict(sweep.beta), **bands},
     }
-
-
-def _detector_section(sweep: DetectorSweep, number: int) -> Section:
-    beta = sweep.beta
-    steps = range(beta.overall.value.shape[1])
-    levels = {
-        str(family): [(f"{LEVELS[level]:g}", _at(beta.overall, (f, level))) for level in steps]
-        for f, family in enumerate(FAMILIES)
-    }
-    states = {"clean": (0, 0)} | {
-        f"{name}, d = {LEVELS[steps[-1]]:g}": (f, -1) for f, name in enumerate(FAMILIES)
-    }
-    bins = range(len(beta.azimuth_deg) - 1)
-    angles = {
-        name: [_at(beta.by_azimuth, (f, b, level)) for b in bins] for name, (f, level) in states.items()
-    }
-    figures = miss_rate_level_figure(levels), miss_rate_angle_figure(angles, beta.azimuth_deg)
-    named = [_of_detector(one, sweep, number) for one in figures]
-    tables = _conditions(sweep, number), _rain(sweep, number)
-    return Section(f"Detector {sweep.detector}", (), (*named, *tables))
 
 
 def _conditions(sweep: DetectorSweep, number: int) -> Table:
@@ -170,10 +150,6 @@ def _rain(sweep: DetectorSweep, number: int) -> Table:
         "Rain degrades the image and adds noise on the roof at the same time; the noise level is relative to "
         "the recording. Optimism: awareness if the effects were independent, minus awareness in rain.",
     )
-
-
-def _of_detector(figure: Figure, sweep: DetectorSweep, number: int) -> Figure:
-    return replace(figure, name=f"{figure.name}_{number}", title=f"{figure.title}, {sweep.detector}")
 
 
 def _at(band: Band, place: tuple[int, ...]) -> Value:

@@ -1,4 +1,4 @@
-"""Panels on calibrated cueing: ROC by horizon, reliability, operating curve; helpers of all panels."""
+"""Panels on calibrated cueing: ROC by horizon, reliability, operating curve, awareness."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -206,3 +206,39 @@ def _mark(canvas: "Canvas", one: OperatingPoint, colour: str, mark: str, label: 
     axes.plot(x.value, y.value, mark, color=colour, ms=6, label=label, linestyle="none")
     if x.paper and y.paper:
         axes.plot(x.paper.value, y.paper.value, mark, color=colour, ms=7, fillstyle="none", linestyle="none")
+
+
+def awareness_figure(families: Mapping[str, Sequence[tuple[Value, Value]]], paper_least: float) -> Figure:
+    """Draw hazard awareness over the measured miss rate beta, one line per family of degradations.
+
+    `families` contains (beta, awareness) by level, the clean camera first.
+    """
+
+    def draw(canvas: "Canvas") -> None:
+        axes = canvas.subplots()
+        axes.plot([0.0, 1.0], [1.0, 0.0], color=GREY, linestyle="--", label=r"vision alone, $1-\beta$")
+        pairs = {name: tuple(zip(*levels, strict=True)) for name, levels in families.items()}
+        for (name, (beta, aware)), mark in zip(pairs.items(), MARKS, strict=False):
+            x = [b.value for b in beta]
+            (line,) = axes.plot(x, [v.value for v in aware], marker=mark, ms=4, label=name)
+            low, high = [v.low for v in aware], [v.high for v in aware]
+            axes.fill_between(x, low, high, color=line.get_color(), alpha=0.13, lw=0)
+        axes.axhline(paper_least, color="black", linewidth=0.9, linestyle=":", label="paper, least")
+        axes.set(xlabel=r"measured miss rate $\beta$ of the camera", ylabel="hazard awareness after $T_0$")
+        axes.set(xlim=(-0.02, 1.02), ylim=(0.0, 1.03))
+        legend_below(canvas)
+
+    return Figure(
+        "cueing_awareness",
+        "(d) Hazard awareness with a degraded camera",
+        "Share of the hops after T0 in which the vehicle is detected or announced, over the share that the "
+        "camera misses; level 0 is the clean camera. Bands are 95 % intervals over recordings.",
+        draw,
+        ("family", "level", "miss_rate", "awareness"),
+        [
+            (name, level, beta.value, aware)
+            for name, levels in families.items()
+            for level, (beta, aware) in enumerate(levels)
+        ],
+        size_in=(4.4, 4.2),
+    )

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import FIGURES, paper_value, titles
+from worldstate_lab.evaluation.figures import FIGURES, titles
 from worldstate_lab.evaluation.protocols import CURVE_ALPHAS, STANDING
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
 from worldstate_lab.evaluation.scores import paired
@@ -14,20 +14,16 @@ from worldstate_lab.trials.trial import Decisions, Trial
 
 from .measured_values import PROPOSED, MeasuredValues, score_values
 from .panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
-from .recording_panels import lead_figure, leads_s
 
 _BUDGETS = {f"proposed {text}": float(text) for text in (".01", ".02", ".05")}
 # Columns of the tables of methods.
 _WARNING = (
     *("lead_s", "detection", "random_detection", "false_alarms_per_hour", "advisory_share", "side_correct"),
-    *("bearing_deg", "lead_missed_zero_s", "early_onsets_per_approach"),
+    *("bearing_deg", "hazard_awareness", "lead_missed_zero_s", "early_onsets_per_approach"),
 )
 _AREAS = ("auroc_all", "auroc_2s", "auroc_1s")
 _CALIBRATION = (*_AREAS, "ece", "ece_floor", "ece_raw", "brier_skill", "hazard_share")
 _TRACKING = ("gospa_deg", "visible_error_s", "visible_error_constant_s", "visible_coverage")
-# Figures by condition of the paper's section VIII: clear is after T0 with the vehicle in view, occluded is
-# before T0.
-_STRATA = ("hazard_awareness", "bearing_deg", "detection", "random_detection", *_AREAS)
 _BUDGET = ("false_alarms_per_hour", "detection", "random_detection", "lead_s")
 _PAIRS = (
     (PROPOSED, "published, sustained"),
@@ -59,30 +55,13 @@ def table_i(measured: MeasuredValues) -> Section:
         "alarms at random moments would detect. The folds are those of the protocol; thresholds are set on "
         "the other folds.",
     )
-    run = measured.found.runs[STANDING]
-    every = {name: leads_s(run.trials, passes) for name, passes in run.decisions.items() if name in _LEADS}
-    leads = {method: lead for method, lead in every.items() if np.isfinite(lead).any()}
-    stated = {method: paper_value(STANDING, method, "lead_s") for method in leads}
     text = (
         f"False alarms are counted on {hours.number} h of hazard-free time, so one alarm onset is "
         f"{quantum.number} per hour (paper: 0.103 h, 9.7 per hour).",
         f"Vision only: a moving box precedes T0 in {early.number} {early.note} approaches (paper: 3 of 42, "
         "attributed to the tolerance of the T0 annotation and printed as 0).",
     )
-    figure = lead_figure(leads, {method: one.value for method, one in stated.items() if one})
-    return Section("Table I", text, (table, figure))
-
-
-_LEADS = (
-    "published",
-    "published, sustained",
-    *_BUDGETS,
-    "proposed .02 + looming",
-    "with absence .02",
-    "shipped model",
-    "+ site adaptation",
-    "world-state advisory",
-)
+    return Section("Table I", text, (table,))
 
 
 def budget_section(measured: MeasuredValues) -> Section:
@@ -198,21 +177,6 @@ def tracking_section(measured: MeasuredValues) -> Section:
         "compared with the constant that fits best, which is computed from these approaches.",
     )
     return Section("Tracking measures", (), (table,))
-
-
-def strata_section(measured: MeasuredValues) -> Section:
-    """Return the figures by condition, clear and occluded; a degraded camera has its own section."""
-    table = measured.table(
-        STANDING,
-        measured.methods(STANDING),
-        _STRATA,
-        "strata",
-        "Clear and occluded, standing ego",
-        "Clear (awareness and bearing): after T0 with the vehicle in view; awareness is an alarm or a moving "
-        "box. Occluded (the other columns): before T0. The third condition, a degraded camera, is in the "
-        "section on vision degradation.",
-    )
-    return Section("Conditions", (), (table,))
 
 
 def difference_section(found: Evaluation) -> Section:
