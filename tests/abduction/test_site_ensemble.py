@@ -308,7 +308,7 @@ def test_a_trained_model_predicts_other_recordings_and_holds_no_row_of_its_data(
     known, other = made_up_table(0), made_up_table(2)
     model = train_model(known, TrainingSettings(repeats=1), dataset="made up", group="static")
     assert model.policies.for_alpha(0.02).reference_prior == model.signature.reference_prior
-    predictions = predict_held_out(model, other, 0.05, "run", np.random.default_rng(0))[0.0]
+    predictions = predict_held_out(model, other, 0.05, "run", np.random.default_rng(0))
     assert (predictions.classes == other.labels).mean() > 0.8
     rows = {value.tobytes() for value in np.log(known.features).ravel()}
     written = [model.signature.home, *(expert.weights for expert in model.signature.experts)]

@@ -81,7 +81,7 @@ def _run(run: Run, words: Sequence[str], arguments: argparse.Namespace) -> Comma
 
 
 # Options for the place of work and of output, which change no figure.
-_NO_FIGURE = ("--results", "--out", "--predictions", "--jobs", "--cache", "--figure")
+_NO_FIGURE = ("--results", "--out", "--jobs", "--cache", "--figure")
 
 
 def result_key(words: Sequence[str]) -> str:

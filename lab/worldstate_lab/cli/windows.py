@@ -6,8 +6,7 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
   --protocol lojo      leave one junction out
   --protocol transfer  train on windows of a standing ego, predict those of --group
 
-  --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right).
-                       The row baseline_absent is eq. (6) without the visible explanation
+  --method baseline    as published: standardise, linear SVC, left/right mirroring; P(left) + P(right)
   --method worldstate  windows relative to the average of their site; mirror-symmetric ensemble; eq. (6)
                        without the visible explanation. "rows" and "gains" compare it with the baseline,
                        with the untrained loudest direction, and with itself under the other references.
@@ -23,8 +22,7 @@ Thresholds and risk maps are set on inner out-of-fold scores of windows with the
 ones, under `run` with five drawn streams, as in `model fit`. Figures are means over the seeds; intervals are
 the middle 95 % of 500 bootstrap samples of recordings, the same for every method.
 
---model evaluates a finished model; it is refused if it was trained on these recordings. Keys that end in
-_absent are of eq. (6) without the visible explanation.
+--model evaluates a finished model; it is refused if it was trained on these recordings.
 
 Examples
 --------
@@ -39,28 +37,24 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
-from scipy.special import bdtrc
 
 from worldstate.abduction.cueing.risk_map import (
     brier_score,
     expected_calibration_error,
 )
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
-from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, read_ids
-from worldstate.adapters.files.file_io import write_rows
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.common.command import add_choice
-from worldstate.cli.common.output import CommandResult, check_outputs
+from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.cli.model.fit import add_table_options, read_beside
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc, mean_of
-from worldstate.operations.training.training import ABSENT_MISS_RATE
 from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
-from worldstate_lab.features.methods import ROWS, Passes, methods, row_of, rows_beside
+from worldstate_lab.features.methods import methods, row_of, rows_beside
 from worldstate_lab.metrics.intervals import (
     DRAWS,
     auroc_by_group,
@@ -75,23 +69,14 @@ from worldstate_lab.metrics.intervals import (
 # The floor depends on the risks alone: another seed per run would only add noise.
 FLOOR_SEED = 0
 Figures = dict[str, float | None]
-DEVIATING = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "fpr", "ece")
-POSTERIORS = tuple(f"p_{label}" for label in CLASSES)
-COLUMNS = ("seed", "fold", "recording", "environment", "class", *POSTERIORS, "score", "risk", "decision")
 
 
 def window_figures(table: FeatureTable, predictions: Predictions) -> Figures:
     """Return the figures of one pass over the table."""
-    scored = table.hazards | table.hazard_free
-    hazards, score = table.hazards[scored], predictions.score[scored]
-    floor = calibration_error_sampling(predictions.risk[scored], np.random.default_rng(FLOOR_SEED))
-    return {
-        **_figures_on(table, predictions)(np.arange(len(table))),
-        "ece_raw": expected_calibration_error(score, hazards),
-        "ece_floor": floor[0],
-        "ece_floor_std": floor[1],
-        "brier_raw": brier_score(score, hazards),
-    }
+    risk = predictions.risk[table.hazards | table.hazard_free]
+    floor, floor_std = calibration_error_sampling(risk, np.random.default_rng(FLOOR_SEED))
+    found = _figures_on(table, predictions)(np.arange(len(table)))
+    return found | {"ece_floor": floor, "ece_floor_std": floor_std}
 
 
 def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray], Figures]:
@@ -130,18 +115,10 @@ def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArra
     }
 
 
-def report(table: FeatureTable, passes: Sequence[dict[float, Predictions]]) -> dict[str, Any]:
-    """Return the mean figures over all passes (seeds), of both statistics."""
-    published, absent = ([one[beta] for one in passes] for beta in (1.0, 0.0))
-    figures, others = ([window_figures(table, one) for one in some] for some in (published, absent))
-    # The posteriors, and so the classes, are the same.
-    means = {f"{key}_absent": value for key, value in mean_figures(others).items() if key != "accuracy"}
-    return {
-        **mean_figures(figures),
-        **means,
-        **count_windows(table),
-        "per_group": report_groups(table, published),
-    }
+def report(table: FeatureTable, passes: Sequence[Predictions]) -> dict[str, Any]:
+    """Return the mean figures over all passes (seeds), counts, and the figures of each junction."""
+    means = mean_figures([window_figures(table, one) for one in passes])
+    return {**means, **count_windows(table), "per_group": report_groups(table, passes)}
 
 
 def count_windows(table: FeatureTable) -> dict[str, int]:
@@ -166,19 +143,6 @@ def mean_figures(figures: Sequence[Figures]) -> Figures:
         key: mean_of([value for figure in figures if (value := figure[key]) is not None])
         for key in figures[0]
     }
-
-
-def write_predictions(
-    path: str | Path, table: FeatureTable, passes: Sequence[Predictions], seeds: Sequence[int]
-) -> None:
-    """Write one row per window and seed, completely or not at all, with exact floats."""
-    rows: list[list[object]] = []
-    for seed, one in zip(seeds, passes, strict=True):
-        about = one.folds, table.recordings, table.environments, table.labels
-        told = *one.probabilities.T, one.score, one.risk, one.decision.astype(int)
-        columns = (column.tolist() for column in (*about, *told))
-        rows += ([seed, *row] for row in zip(*columns, strict=True))
-    write_rows(path, COLUMNS, rows)
 
 
 def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[str, Figures]:
@@ -206,7 +170,7 @@ def run_passes(
     simulated: SimulatedWindows | None = None,
     jobs: int = 1,
     on_pass: Callable[[], None] = lambda: None,
-) -> dict[str, Passes]:
+) -> dict[str, list[Predictions]]:
     """Run every seed of every method; the result does not depend on the number of jobs."""
     known = methods(simulated)
     tasks = [(name, seed) for name in names for seed in range(seeds)]
@@ -214,7 +178,7 @@ def run_passes(
     outcomes = Parallel(n_jobs=jobs, return_as="generator")(
         run(known[name], table, protocol, seed=seed, alpha=alpha, train=train) for name, seed in tasks
     )
-    passes: dict[str, Passes] = {name: [] for name in names}
+    passes: dict[str, list[Predictions]] = {name: [] for name in names}
     for (name, _), outcome in zip(tasks, outcomes, strict=True):
         passes[name].append(outcome)
         on_pass()
@@ -222,7 +186,7 @@ def run_passes(
 
 
 def comparison(
-    table: FeatureTable, passes: Mapping[str, Passes], row: str, alpha: float, draws: int = DRAWS
+    table: FeatureTable, passes: Mapping[str, Sequence[Predictions]], row: str, draws: int = DRAWS
 ) -> dict[str, Any]:
     """Return the figures of one row, those of all others, and its gains over each.
 
@@ -233,16 +197,9 @@ def comparison(
     passes : mapping of str to list
         From `run_passes`.
     row : str
-        Name in `ROWS` of the row of the plain keys.
-    alpha : float
-        Budget, for the test of the achieved false-positive rate.
+        Method of the plain keys.
     draws : int
         Number of bootstrap samples.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If that row's method has no passes.
 
     Returns
     -------
@@ -257,23 +214,21 @@ def comparison(
     >>> features = np.where(labels == "none", 0.1, 0.2)[:, None] * rng.lognormal(0.0, 0.2, (80, 60))
     >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
     >>> passes = run_passes(["baseline"], table, "cv", seeds=1, alpha=0.1)
-    >>> comparison(table, passes, "baseline", alpha=0.1, draws=20)["auroc_pooled"] > 0.9
+    >>> comparison(table, passes, "baseline", draws=20)["auroc_pooled"] > 0.9
     True
     """
-    chosen = {name: row_predictions(passes, name) for name in ROWS if ROWS[name].method in passes}
-    if row not in chosen:
-        raise InvalidArgumentError(f"method: expected passes of {row}, got {', '.join(passes)}")
     samples = recording_draws(table, np.random.default_rng(BOOTSTRAP_SEED), draws)
-    drawn = {name: draw_figures(table, mine, samples) for name, mine in chosen.items()}
-    rows = {name: _row_figures(table, mine, drawn[name], alpha) for name, mine in chosen.items()}
+    drawn = {name: draw_figures(table, mine, samples) for name, mine in passes.items()}
+    rows: dict[str, dict[str, Any]] = {
+        name: mean_figures([window_figures(table, one) for one in mine])
+        | {"intervals": {figure: middle(values) for figure, values in drawn[name].items()}}
+        for name, mine in passes.items()
+    }
     others = [name for name in rows if name != row]
-    by_seed = [window_figures(table, one) for one in chosen[row]]
     return {
         **rows[row],
-        "seed_std": {key: np.std(np.array([one[key] for one in by_seed], float)).item() for key in DEVIATING},
-        "statistic": "absent" if ROWS[row].miss_rate == ABSENT_MISS_RATE else "published",
         **count_windows(table),
-        "per_group": report_groups(table, chosen[row]),
+        "per_group": report_groups(table, passes[row]),
         "rows": {name: rows[name] for name in others},
         "gains": {
             name: {
@@ -282,25 +237,6 @@ def comparison(
             }
             for name in others
         },
-    }
-
-
-def row_predictions(passes: Mapping[str, Passes], row: str) -> list[Predictions]:
-    """Return the predictions of one row, seed by seed."""
-    return [one[ROWS[row].miss_rate] for one in passes[ROWS[row].method]]
-
-
-def _row_figures(
-    table: FeatureTable, passes: Sequence[Predictions], draws: Mapping[str, FloatArray], alpha: float
-) -> dict[str, Any]:
-    figures = mean_figures([window_figures(table, one) for one in passes])
-    n = int(table.hazard_free.sum())
-    # Probability of at least as many false positives if the true rate is the budget.
-    p_value = float(bdtrc(round((figures["fpr"] or 0.0) * n) - 1, n, alpha))
-    return {
-        **figures,
-        "fpr_p_value": p_value,
-        "intervals": {name: middle(one) for name, one in draws.items()},
     }
 
 
@@ -316,7 +252,6 @@ def draw_figures(
     return {name: np.array(values, float).mean(axis=0) for name, values in draws.items()}
 
 
-Report = dict[str, Any]
 # Gains in the table; the JSON object has all of them.
 SHOWN_GAINS = ("accuracy", "auroc_macro", "auroc_pooled", "tpr", "brier")
 
@@ -334,46 +269,39 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--alpha", type=float, default=0.02, help="false-positive budget (default: 0.02)")
     add("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
-    add("--predictions", type=Path, metavar="CSV", help="write one row per window and seed")
 
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
-    check_outputs(arguments, "predictions")
     whole = read_features(arguments.table)
     table = whole.group(arguments.group)
     if arguments.only is not None:
         table = table.only(read_ids(arguments.only))
-    evaluate = _evaluate_model if arguments.model is not None else _evaluate_method
-    figures, predictions = evaluate(arguments, whole, table)
-    if arguments.predictions is not None:
-        write_predictions(arguments.predictions, table, predictions, range(len(predictions)))
+    given = ("method", "protocol", "group", "reference", "seeds", "alpha")
+    origin: dict[str, Any] = {name: getattr(arguments, name) for name in given}
+    if arguments.model is not None:
+        model, rng = read_model(arguments.model), np.random.default_rng(0)
+        predictions = predict_held_out(model, table, arguments.alpha, arguments.reference, rng)
+        origin |= {"method": "model", "protocol": "held-out", "seeds": 1}
+        figures = origin | report(table, [predictions])
+    else:
+        row = row_of(arguments.method, arguments.protocol, arguments.reference)
+        figures = origin | {"row": row} | comparison(table, _passes(arguments, whole, table, row), row)
     return CommandResult(figures, table=_flat(figures))
-
-
-def _evaluate_method(
-    arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
-) -> tuple[Report, list[Predictions]]:
-    row = row_of(arguments.method, arguments.protocol, arguments.reference)
-    passes = _passes(arguments, whole, table, row)
-    compared = comparison(table, passes, row, arguments.alpha)
-    origin = _origin(arguments, arguments.method, arguments.protocol, arguments.seeds)
-    return origin | {"row": row} | compared, row_predictions(passes, row)
 
 
 def _passes(
     arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable, row: str
-) -> dict[str, Passes]:
+) -> dict[str, list[Predictions]]:
     """Run every seed of the method and of its peers."""
     in_range("--seeds", arguments.seeds, 1, 10_000)
     afar = arguments.protocol == "transfer"
     if afar and arguments.group != "dynamic":
         raise InvalidArgumentError("--protocol transfer: expected --group dynamic, training uses static")
     names = (row, *rows_beside(row, arguments.protocol, arguments.reference))
-    methods = list(dict.fromkeys(ROWS[name].method for name in names))
-    with progress_bar("evaluating", arguments.seeds * len(methods)) as bar:
+    with progress_bar("evaluating", arguments.seeds * len(names)) as bar:
         return run_passes(
-            methods,
+            names,
             table,
             arguments.protocol,
             seeds=arguments.seeds,
@@ -385,28 +313,7 @@ def _passes(
         )
 
 
-def _evaluate_model(
-    arguments: argparse.Namespace, whole: FeatureTable, table: FeatureTable
-) -> tuple[Report, list[Predictions]]:
-    predictions = predict_held_out(
-        read_model(arguments.model), table, arguments.alpha, arguments.reference, np.random.default_rng(0)
-    )
-    figures = _origin(arguments, "model", "held-out", 1) | report(table, [predictions])
-    return figures, [predictions[1.0]]
-
-
-def _origin(arguments: argparse.Namespace, method: str, protocol: str, seeds: int) -> Report:
-    return {
-        "method": method,
-        "protocol": protocol,
-        "group": arguments.group,
-        "reference": arguments.reference,
-        "seeds": seeds,
-        "alpha": arguments.alpha,
-    }
-
-
-def _flat(figures: Report) -> dict[str, object]:
+def _flat(figures: Mapping[str, Any]) -> dict[str, object]:
     """Return one line per junction and per compared row, as text."""
     flat = {key: value for key, value in figures.items() if not isinstance(value, dict)}
     intervals = figures.get("intervals", {})

@@ -6,7 +6,7 @@ are set on inner out-of-fold scores of the training windows.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, cast
 
 import numpy as np
@@ -26,7 +26,8 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 from worldstate.operations.training.site_references import asked_while_listening, with_site_references
 from worldstate.operations.training.training import (
-    MISS_RATES,
+    ABSENT_MISS_RATE,
+    PUBLISHED_MISS_RATE,
     WindowCalibration,
     asked_on_streams,
     calibrate_passes,
@@ -49,6 +50,7 @@ class WindowMethod:
     """One way to compute a risk from windows."""
 
     make: Callable[[np.random.Generator], Classifier]  # Returns an untrained classifier
+    miss_rate: float = ABSENT_MISS_RATE  # beta of the statistic
     # Reference of the scored windows, None if the method uses none. Training is the same in any case, as in
     # `model fit`.
     reference: Reference | None = None
@@ -93,23 +95,19 @@ class WindowMethod:
         windows = table.features[:, :N_FEATURES]
         return [lambda classifier, rows: classifier.predict_proba(windows[rows])]
 
-    def calibrations(
+    def calibration(
         self, train: FeatureTable, protocol: Protocol, rng: np.random.Generator, alpha: float
-    ) -> dict[float, tuple[WindowCalibration, float]]:
-        """Return threshold, risk map and the mean risk of the training windows, for each beta."""
+    ) -> tuple[WindowCalibration, float]:
+        """Return threshold and risk map, and the mean risk of the training windows."""
         like_outer: Protocol = "cv" if protocol == "cv" else "lojo"
         # The folds are ordered from the most to the least cautious.
         both = self.reference is not None and not self.afar and like_outer == "lojo"
         inner: tuple[Protocol, ...] = ("lojo", "cv") if both else (like_outer,)
-        asks = self.asks(train, rng)
+        asks, beta = self.asks(train, rng), self.miss_rate
         scores = [self.passes(train, rng, one, asks) for one in inner]
         fit_map = fit_isotonic if self.reference is None else fit_platt
-        found = {}
-        for beta in MISS_RATES:
-            learned = calibrate_passes(train, scores, alpha=alpha, miss_rate=beta, fit_map=fit_map)
-            mean_risk = float(learned.risk_map(hazard_statistic(np.concatenate(scores[-1]), beta)).mean())
-            found[beta] = learned, mean_risk
-        return found
+        learned = calibrate_passes(train, scores, alpha=alpha, miss_rate=beta, fit_map=fit_map)
+        return learned, float(learned.risk_map(hazard_statistic(np.concatenate(scores[-1]), beta)).mean())
 
 
 def folds_of(protocol: Protocol, table: FeatureTable, rng: np.random.Generator) -> TextArray:
@@ -143,34 +141,10 @@ def asked_under(
 class Predictions:
     """One prediction for every window of a table."""
 
-    folds: TextArray  # shape (n,): Fold in which each window was held out
     probabilities: FloatArray  # shape (n, 4): Posteriors of front, left, none, right
     score: FloatArray  # shape (n,): Statistic; below, the calibrated risk
     risk: FloatArray
     decision: BoolArray  # shape (n,): Whether the statistic reached the threshold
-
-    @classmethod
-    def blank(cls, folds: TextArray) -> "Predictions":
-        """Return empty arrays to be filled in, fold by fold."""
-        n = len(folds)
-        return cls(folds, np.empty((n, len(CLASSES))), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_))
-
-    def fill(self, rows: BoolArray, probabilities: FloatArray, calibration: WindowCalibration) -> None:
-        """Store score, risk and decision of some rows, computed from their posteriors by a calibration."""
-        self.probabilities[rows] = probabilities
-        self.score[rows], self.risk[rows], self.decision[rows] = calibration.apply(probabilities)
-
-    @classmethod
-    def of_model(
-        cls, probabilities: FloatArray, calibration: WindowCalibration, fold: str = "model"
-    ) -> "Predictions":
-        """Return the predictions of a trained model, as one fold.
-
-        Shapes: probabilities (n, 4).
-        """
-        predictions = cls.blank(np.full(len(probabilities), fold))
-        predictions.fill(np.ones(len(probabilities), dtype=np.bool_), probabilities, calibration)
-        return predictions
 
     @property
     def classes(self) -> TextArray:
@@ -187,7 +161,7 @@ def evaluate_pass(
     seed: int,
     alpha: float,
     train: FeatureTable | None = None,
-) -> dict[float, Predictions]:
+) -> Predictions:
     """Run one seed of one method; `train` is the training set of ``transfer``."""
     rng, inputs = np.random.default_rng(seed), method.prepare(table)
     ask = _asked_plainly(inputs)
@@ -207,7 +181,7 @@ def cross_validate(
     *,
     alpha: float,
     ask: Ask | None = None,
-) -> dict[float, Predictions]:
+) -> Predictions:
     """Predict every window once, with classifier, threshold and map trained without its fold.
 
     Parameters
@@ -227,8 +201,8 @@ def cross_validate(
 
     Returns
     -------
-    dict of float to Predictions
-        For each beta: 1, the published statistic, and 0, without the visible explanation.
+    Predictions
+        One for each window.
 
     Examples
     --------
@@ -239,20 +213,21 @@ def cross_validate(
     >>> loud = np.where(labels == "none", 0.1, 0.2)[:, None]
     >>> features = loud * rng.lognormal(0.0, 0.2, (80, 60))
     >>> table = FeatureTable(features, labels, keys, np.tile(["SA1", "SB1"], 40), keys, (None,) * 80)
-    >>> found = cross_validate(table, "cv", WindowMethod(PublishedClassifier), rng, alpha=0.1)
-    >>> alarms = found[0.0].decision
+    >>> alarms = cross_validate(table, "cv", WindowMethod(PublishedClassifier), rng, alpha=0.1).decision
     >>> bool(alarms[table.hazards].mean() > alarms[table.hazard_free].mean())
     True
     """
     folds, ask = folds_of(protocol, table, rng), ask or _asked_plainly(table)
-    predictions = {beta: Predictions.blank(folds) for beta in MISS_RATES}
+    n = len(table)
+    found = Predictions(np.empty((n, len(CLASSES))), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_))
     for fold in np.unique(folds):
         held_out = folds == fold
         train = table.select(~held_out)
         probabilities = ask(method.trained(train, rng), held_out)
-        for beta, (learned, _) in method.calibrations(train, protocol, rng, alpha).items():
-            predictions[beta].fill(held_out, probabilities, learned)
-    return predictions
+        learned, _ = method.calibration(train, protocol, rng, alpha)
+        found.probabilities[held_out] = probabilities
+        found.score[held_out], found.risk[held_out], found.decision[held_out] = learned.apply(probabilities)
+    return found
 
 
 def transfer(
@@ -263,22 +238,19 @@ def transfer(
     *,
     alpha: float,
     ask: Ask,
-) -> dict[float, Predictions]:
+) -> Predictions:
     """Predict every window of one table after training on another."""
     shared = np.intersect1d(train.recording_keys, test.recording_keys)
     if shared.size:
         raise InvalidArgumentError(
             f"transfer: expected different recordings for the test, {shared.size} shared"
         )
-    calibrations = method.calibrations(train, "transfer", rng, alpha)
+    learned, mean_risk = method.calibration(train, "transfer", rng, alpha)
     probabilities = ask(method.trained(train, rng), np.ones(len(test), dtype=np.bool_))
-    predictions = {}
-    for beta, (learned, mean_risk) in calibrations.items():
-        one = Predictions.of_model(probabilities, learned, "transfer")
-        if method.afar:
-            one = replace(one, risk=matched_risk(one.risk, test, mean_risk))
-        predictions[beta] = one
-    return predictions
+    score, risk, decision = learned.apply(probabilities)
+    return Predictions(
+        probabilities, score, matched_risk(risk, test, mean_risk) if method.afar else risk, decision
+    )
 
 
 def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> FloatArray:
@@ -318,8 +290,8 @@ def _shift(log_odds: FloatArray, mean: float) -> float:
 
 def predict_held_out(
     model: Model, table: FeatureTable, alpha: float, reference: Reference, rng: np.random.Generator
-) -> dict[float, Predictions]:
-    """Predict windows of recordings outside a model's training set, for each beta as in `cross_validate`."""
+) -> Predictions:
+    """Predict windows of recordings outside a model's training set, by the published statistic."""
     if model.domain is not None:
         # A table without a domain, such as the released one, is OVAD's.
         check_tables(model.domain, table.domain or ovad_domain(table.environments.tolist()))
@@ -329,12 +301,9 @@ def predict_held_out(
         probabilities = ask(model.signature, np.ones(len(table), dtype=np.bool_))
     else:
         probabilities = model.signature.predict_proba(table.features)
-    predictions = {}
-    for miss_rate in MISS_RATES:
-        policy = model.policies.for_alpha(alpha, miss_rate)
-        calibration = WindowCalibration(miss_rate, policy.gamma, policy.risk_map)
-        predictions[miss_rate] = Predictions.of_model(probabilities, calibration)
-    return predictions
+    policy = model.policies.for_alpha(alpha, PUBLISHED_MISS_RATE)
+    calibration = WindowCalibration(PUBLISHED_MISS_RATE, policy.gamma, policy.risk_map)
+    return Predictions(probabilities, *calibration.apply(probabilities))
 
 
 def check_unseen(model: Model, table: FeatureTable) -> None:

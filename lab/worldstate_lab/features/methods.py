@@ -1,6 +1,6 @@
 """Methods and baselines of an evaluation on feature windows."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Self
 
@@ -15,12 +15,11 @@ from worldstate.abduction.signature.ensemble_training import (
 )
 from worldstate.abduction.signature.window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.training.training import ABSENT_MISS_RATE, PUBLISHED_MISS_RATE, trained_ensemble
+from worldstate.operations.training.training import PUBLISHED_MISS_RATE, trained_ensemble
 from worldstate_lab.features.published_classifier import Classifier, PublishedClassifier
 
-from .feature_evaluation import Predictions, Protocol, Reference, WindowMethod
+from .feature_evaluation import Protocol, Reference, WindowMethod
 
-Passes = list[dict[float, Predictions]]
 REFERENCES: tuple[Reference, ...] = ("run", "cold", "curated")
 
 
@@ -45,14 +44,6 @@ class LoudestDirection:
         posteriors[:, LEFT] = posteriors[:, RIGHT] = odds / (1.0 + odds) / 2.0
         posteriors[:, FRONT] = 0.0
         return posteriors
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One row of the comparison: a method and its statistic."""
-
-    method: str  # Name in `methods`
-    miss_rate: float  # beta of the statistic
 
 
 def _loudest_direction(rng: np.random.Generator) -> Classifier:
@@ -81,19 +72,12 @@ def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod
     # (lab/NOTES.md).
     distant = WindowMethod(_distant_site, afar=True)
     return {
-        "baseline": WindowMethod(PublishedClassifier),
+        "baseline": WindowMethod(PublishedClassifier, PUBLISHED_MISS_RATE),
         "loudest_direction": WindowMethod(_loudest_direction),
         **{f"ensemble_{one}": replace(ensemble, reference=one) for one in REFERENCES},
         **{f"distant_site_{one}": replace(distant, reference=one) for one in REFERENCES},
     }
 
-
-# Statistics of each method, by name of the row.
-ROWS = {
-    "baseline": Row("baseline", PUBLISHED_MISS_RATE),
-    "baseline_absent": Row("baseline", ABSENT_MISS_RATE),
-    **{name: Row(name, ABSENT_MISS_RATE) for name in methods() if name != "baseline"},
-}
 
 # The method of `worldstate`: the ensemble if the ego moves as in training, a single expert otherwise. The
 # choice depends only on the known motion of the ego.
@@ -101,7 +85,7 @@ OURS: dict[Protocol, str] = {"cv": "ensemble", "lojo": "ensemble", "transfer": "
 
 
 def row_of(method: str, protocol: Protocol, reference: Reference) -> str:
-    """Return the name in `ROWS` of a method under a protocol and a reference."""
+    """Return the name in `methods` of a method under a protocol and a reference."""
     return f"{OURS[protocol]}_{reference}" if method == "worldstate" else method
 
 
@@ -112,7 +96,7 @@ def rows_beside(row: str, protocol: Protocol, reference: Reference) -> tuple[str
     others = tuple(row_of("worldstate", protocol, other) for other in REFERENCES if other != reference)
     # If the motion of the ego differs from training, the ensemble is a baseline too.
     afar = (f"ensemble_{reference}",) if protocol == "transfer" else ()
-    return ("baseline", "baseline_absent", "loudest_direction", *others, *afar)
+    return ("baseline", "loudest_direction", *others, *afar)
 
 
 def method_of(method: str) -> WindowMethod:
