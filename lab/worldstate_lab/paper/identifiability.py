@@ -5,16 +5,18 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import entr
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+from scipy.spatial import cKDTree
+from scipy.special import digamma, entr
 
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_information
-from worldstate.ground.checks import check_shape, finite_array, in_range
+from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import FloatArray, IndexArray
+from worldstate.ground.typing import AnyArray, FloatArray, IndexArray
 from worldstate_lab.features.methods import method_of
 from worldstate_lab.metrics.intervals import pooled_draws
 
@@ -57,10 +59,7 @@ def entropy_bits(probabilities: ArrayLike) -> float:
     ----------
     C. E. Shannon, "A mathematical theory of communication", Bell Syst. Tech. J. 27, 1948.
     """
-    p = finite_array("probabilities", probabilities, (None,))
-    if not p.size or (p < 0.0).any() or not math.isclose(float(p.sum()), 1.0, abs_tol=1e-6):
-        raise InvalidArgumentError("probabilities: expected probabilities that sum to one")
-    return float(entr(p).sum()) * _BITS
+    return float(entr(np.asarray(probabilities)).sum()) * _BITS
 
 
 def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Information:
@@ -86,11 +85,6 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
     Information
         Bits.
 
-    Raises
-    ------
-    InvalidArgumentError
-        If shapes differ, a row is not a distribution or a state is invalid.
-
     References
     ----------
     D. Barber and F. Agakov, "The IM algorithm: a variational approach to information maximization", 2003.
@@ -101,7 +95,7 @@ def information_from_posteriors(posteriors: ArrayLike, states: ArrayLike) -> Inf
     >>> round(sure.lower, 2), round(sure.plug_in, 2)
     (1.0, 1.0)
     """
-    q, z = _checked(posteriors, states)
+    q, z = np.asarray(posteriors), np.asarray(states)
     own = np.log2(np.maximum(q[np.arange(z.size), z], _SMALLEST))
     spread = -(q * np.log2(np.maximum(q, _SMALLEST))).sum(axis=1)
     prior = state_entropy_bits(z, q.shape[1])
@@ -157,7 +151,7 @@ def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike) -
     Raises
     ------
     InvalidArgumentError
-        If shapes differ or no state has enough windows.
+        If no state has enough windows.
 
     References
     ----------
@@ -170,13 +164,7 @@ def nearest_neighbour_information_bits(features: ArrayLike, states: ArrayLike) -
     >>> round(nearest_neighbour_information_bits(rng.normal(size=(2000, 1)) + 8.0 * z[:, None], z), 1)
     1.0
     """
-    from scipy.spatial import cKDTree
-    from scipy.special import digamma
-
-    x = finite_array("features", features, (None, None))
-    z = np.asarray(states)
-    check_shape("states", z.shape, (len(x),))
-    k = _NEIGHBOURS
+    x, z, k = np.asarray(features), np.asarray(states), _NEIGHBOURS
     names, counts = np.unique(z, return_counts=True)
     kept = np.isin(z, names[counts > k])
     x, z = x[kept], z[kept]
@@ -213,11 +201,6 @@ def fano_bound(entropy: float, information: float, states: int) -> float:
     float
         In [0, 1].
 
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
     References
     ----------
     "Evidence of Absence", proposition 1, part (i).
@@ -227,8 +210,7 @@ def fano_bound(entropy: float, information: float, states: int) -> float:
     >>> fano_bound(entropy=2.0, information=0.2, states=4)
     0.4
     """
-    h, i, k = _fano_numbers(entropy, information, states)
-    return min(max((h - i - 1.0) / math.log2(k), 0.0), 1.0)
+    return min(max((entropy - max(information, 0.0) - 1.0) / math.log2(states), 0.0), 1.0)
 
 
 def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
@@ -238,8 +220,6 @@ def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
 
     with the binary entropy h, solved for the smallest P_e. It is never below `fano_bound`, and the symmetric
     channel attains it.
-
-    Errors are raised as in `fano_bound`.
 
     Parameters
     ----------
@@ -262,36 +242,16 @@ def sharp_fano_bound(entropy: float, information: float, states: int) -> float:
     >>> round(sharp_fano_bound(entropy=1.0, information=0.5310, states=2), 3)
     0.1
     """
-    from scipy.optimize import brentq
-
-    h, i, k = _fano_numbers(entropy, information, states)
-    remaining, largest = h - i, (k - 1.0) / k
+    remaining, largest = entropy - max(information, 0.0), (states - 1.0) / states
     if remaining <= 0.0:
         return 0.0
-    if remaining >= math.log2(k) - 1e-12:
+    if remaining >= math.log2(states) - 1e-12:
         return largest
-    return float(brentq(lambda p: _fano_function(p, k) - remaining, 0.0, largest))
 
+    def surplus(error: float) -> float:
+        return entropy_bits((error, 1.0 - error)) + error * math.log2(states - 1) - remaining
 
-def _fano_numbers(entropy: float, information: float, states: int) -> tuple[float, float, int]:
-    k = int(in_range("states", states, 2, 1_000_000))
-    h = in_range("entropy", entropy, 0.0, math.log2(k) + 1e-9)
-    return h, max(in_range("information", information, -math.inf, math.inf), 0.0), k
-
-
-def _fano_function(error: float, states: int) -> float:
-    return entropy_bits((error, 1.0 - error)) + error * math.log2(states - 1)
-
-
-def _checked(posteriors: ArrayLike, states: ArrayLike) -> tuple[FloatArray, IndexArray]:
-    q = finite_array("posteriors", posteriors, (None, None))
-    z = np.asarray(states)
-    check_shape("states", z.shape, (len(q),))
-    if not z.size or (q < 0.0).any() or not np.allclose(q.sum(axis=1), 1.0, atol=1e-6):
-        raise InvalidArgumentError("posteriors: expected at least one row, and each row a distribution")
-    if z.dtype.kind not in "iu" or z.min() < 0 or z.max() >= q.shape[1]:
-        raise InvalidArgumentError(f"states: expected integers from 0 to {q.shape[1] - 1}")
-    return q, z.astype(np.intp)
+    return float(brentq(surplus, 0.0, largest))
 
 
 # In more dimensions, a kNN estimate from a few hundred windows is far below the true value.
@@ -308,7 +268,7 @@ class ReachOnData:
     windows: int
     entropy_bits: float  # H(z)
     # Estimates of I(z; x), bits: variational lower bound and plug-in from the posteriors, and kNN on the
-    # leading components of the features (NaN without features).
+    # leading components of the features.
     information_lower: float
     information_plug_in: float
     information_neighbours: float
@@ -322,12 +282,11 @@ class ReachOnData:
 
 
 def reach_on_data(
-    posteriors: ArrayLike,
-    states: ArrayLike,
+    posteriors: FloatArray,
+    states: IndexArray,
+    features: FloatArray,
+    groups: AnyArray,
     rng: np.random.Generator,
-    *,
-    features: ArrayLike | None = None,
-    groups: ArrayLike | None = None,
 ) -> ReachOnData:
     """Bound the error of any detector on windows like these.
 
@@ -337,55 +296,46 @@ def reach_on_data(
 
     Parameters
     ----------
-    posteriors : array_like, shape (n, K)
+    posteriors : ndarray, shape (n, K)
         Of windows outside the classifier's training set.
-    states : array_like of int, shape (n,)
+    states : ndarray of int, shape (n,)
         True states, 0 to K - 1.
+    features : ndarray, shape (n, d)
+        For the kNN estimate.
+    groups : ndarray, shape (n,)
+        Recording of each window.
     rng : numpy.random.Generator
         Draws the bootstrap.
-    features : array_like, shape (n, d), optional
-        For the kNN estimate.
-    groups : array_like, shape (n,), optional
-        Recording of each window; by default each window is its own.
 
     Returns
     -------
     ReachOnData
         Information in bits, the two bounds, and the classifier's own error.
 
-    Raises
-    ------
-    InvalidArgumentError
-        If shapes do not match or there are fewer than two states.
-
     Examples
     --------
     >>> z = np.arange(400) % 2
     >>> q = np.where(z[:, None] == np.arange(2), 0.9, 0.1)
-    >>> found = reach_on_data(q, z, np.random.default_rng(0))
+    >>> found = reach_on_data(q, z, q, np.arange(400), np.random.default_rng(0))
     >>> round(found.information_plug_in, 2), found.error
     (0.53, 0.0)
     """
-    q, z = finite_array("posteriors", posteriors, (None, None)), np.asarray(states)
-    if q.shape[1] < 2:
-        raise InvalidArgumentError(f"posteriors: expected at least two states, got {q.shape[1]}")
-    found = information_from_posteriors(q, z)
-    near = math.nan if features is None else _neighbours(features, z)
-    units = np.arange(len(q)) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
-    entropy = state_entropy_bits(z, q.shape[1])
-    largest = float(np.nanmax([found.lower, found.plug_in, near]))
-    high = min(largest + 2.0 * _spread(q, z, units, rng), entropy)
+    found, near = information_from_posteriors(posteriors, states), _neighbours(features, states)
+    count = posteriors.shape[1]
+    entropy = state_entropy_bits(states, count)
+    largest = max(found.lower, found.plug_in, near)
+    high = min(largest + 2.0 * _spread(posteriors, states, groups, rng), entropy)
     return ReachOnData(
-        states=q.shape[1],
-        windows=len(q),
+        states=count,
+        windows=len(states),
         entropy_bits=entropy,
         information_lower=found.lower,
         information_plug_in=found.plug_in,
         information_neighbours=near,
         information_high=high,
-        error=float(np.mean(q.argmax(axis=1) != z)),
-        fano=fano_bound(entropy, high, q.shape[1]),
-        sharp_fano=sharp_fano_bound(entropy, high, q.shape[1]),
+        error=float(np.mean(posteriors.argmax(axis=1) != states)),
+        fano=fano_bound(entropy, high, count),
+        sharp_fano=sharp_fano_bound(entropy, high, count),
     )
 
 
@@ -395,8 +345,7 @@ def reach_on_table(table: FeatureTable, method: str, rng: np.random.Generator) -
     chosen = method_of(method)
     posteriors = replace(chosen, reference=None).posteriors(chosen.prepare(table), rng)
     states = np.array([CLASSES.index(label) for label in table.labels.tolist()])
-    features = np.log(table.features)
-    return reach_on_data(posteriors, states, rng, features=features, groups=table.recording_keys)
+    return reach_on_data(posteriors, states, np.log(table.features), table.recording_keys, rng)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -446,11 +395,6 @@ def reach_of_array(
     ReachOfArray
         Standard deviations, shape (n,), and the share of the best direction's information.
 
-    Raises
-    ------
-    InvalidArgumentError
-        See `frontend.bounds.cramer_rao.bearing_crb_rad2`.
-
     Examples
     --------
     >>> from worldstate.frontend.array.microphone_array import roof_array_56
@@ -459,7 +403,6 @@ def reach_of_array(
     True
     """
     azimuths = finite_array("azimuths_rad", azimuths_rad, (None,))
-    seen = _vision_information(vision_std_rad)
     variance = np.array(
         [
             bearing_crb_rad2(array.positions_m, azimuth, frequencies_hz, snr, snapshots, random_signal=True)
@@ -469,7 +412,7 @@ def reach_of_array(
     heard = np.divide(1.0, variance, out=np.zeros_like(variance), where=np.isfinite(variance))
     std = np.sqrt(variance)
     with np.errstate(divide="ignore"):
-        together = 1.0 / np.sqrt(heard + seen)
+        together = 1.0 / np.sqrt(heard + vision_std_rad**-2)
     return ReachOfArray(
         azimuths_rad=azimuths,
         # Round-off leaves a little information at endfire: a standard deviation above half a turn means no
@@ -480,15 +423,8 @@ def reach_of_array(
     )
 
 
-def _vision_information(std_rad: float) -> float:
-    if std_rad == math.inf:
-        return 0.0
-    return float(1.0 / in_range("vision_std_rad", std_rad, 0.0, math.inf, open_low=True) ** 2)
-
-
-def _neighbours(features: ArrayLike, states: NDArray[np.int_]) -> float:
+def _neighbours(x: FloatArray, states: IndexArray) -> float:
     """Return the kNN estimate on the leading components of the standardised features."""
-    x = finite_array("features", features, (len(states), None))
     spread = x.std(axis=0)
     x = (x - x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
     _, _, axes = np.linalg.svd(x, full_matrices=False)
@@ -496,8 +432,9 @@ def _neighbours(features: ArrayLike, states: NDArray[np.int_]) -> float:
     return nearest_neighbour_information_bits(components / components.std(axis=0), states)
 
 
-def _spread(q: FloatArray, states: NDArray[np.int_], units: IndexArray, rng: np.random.Generator) -> float:
+def _spread(q: FloatArray, states: IndexArray, groups: AnyArray, rng: np.random.Generator) -> float:
     """Return the bootstrap standard deviation of the lower bound, with draws of whole recordings."""
+    units = np.unique(groups, return_inverse=True)[1]
     order = np.argsort(units, kind="stable")
     rows = np.split(order, np.cumsum(np.bincount(units))[:-1])
     chosen = pooled_draws(rows, [0] * len(rows), rng, _BOOTSTRAPS)
