@@ -41,9 +41,9 @@ def made_up_rows(seed: int, apart: float = 4.0) -> RoadUserRows:
 def test_distinct_classes_are_separated_and_equal_ones_have_the_prior() -> None:
     rows, fresh = made_up_rows(1), made_up_rows(2)
     found = road_user_exam(rows)
-    assert found.log_loss < 0.7 * found.prior_log_loss
-    assert found.recall_of_equals[:-1].min() > 0.5
-    np.testing.assert_allclose(found.confusion.sum(axis=1), 1.0, atol=1e-9)
+    assert found["log_loss"] < 0.7 * found["prior_log_loss"]
+    assert found["recall_of_equals"][:-1].min() > 0.5
+    np.testing.assert_allclose(found["confusion"].sum(axis=1), 1.0, atol=1e-9)
     # Classes have the shares of a town, although kinds are drawn equally often.
     said = fit_road_users(rows).probabilities(fresh.measures)
     expected = np.average(said, axis=0, weights=fresh.weights)
@@ -51,7 +51,7 @@ def test_distinct_classes_are_separated_and_equal_ones_have_the_prior() -> None:
     # Random labels have nothing to learn.
     dealt = replace(rows, kinds=np.random.default_rng(3).permutation(rows.kinds))
     nothing = road_user_exam(replace(dealt, measures=made_up_rows(4, apart=0.0).measures))
-    assert nothing.log_loss > 0.8 * nothing.prior_log_loss
+    assert nothing["log_loss"] > 0.8 * nothing["prior_log_loss"]
 
 
 @pytest.mark.slow

@@ -35,6 +35,7 @@ from worldstate.commissioning.road_user_training import tilted
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray, TextArray
+from worldstate_lab.report.table import Table, cell_text
 
 MOST_BYTES = 1 << 30
 NUMBERS = len(MEASURES) + len(BANDS)
@@ -120,50 +121,45 @@ def _calibration(clips: ClipNumbers, model: RoadUserModel) -> dict[str, Any]:
         raise InvalidArgumentError(
             f"road_user: expected one of {', '.join(model.classes)}, got {min(strange)!r}"
         )
-    named = zip(clips.recordings[known].tolist(), clips.road_users[known].tolist(), strict=True)
-    recordings = dict(named)
+    recordings = dict(zip(clips.recordings[known].tolist(), clips.road_users[known].tolist(), strict=True))
     counts = np.array([sum(user == name for user in recordings.values()) for name in model.classes])
     prior = counts / counts.sum()
     hops = known[clips.clip]
-    truth = np.array([model.classes.index(user) if user else 0 for user in clips.road_users.tolist()])[
-        clips.clip
-    ]
+    truth = np.array([model.classes.index(user) if user else 0 for user in clips.road_users.tolist()])
+    truth = truth[clips.clip]
     said = model.with_shares(prior).probabilities(clips.measures)
-    rows, tiny = np.arange(len(truth)), np.finfo(float).tiny
-    losses = -np.log(np.maximum(said[rows, truth], tiny))
-    sure, right = said.max(axis=1) >= SAID, said.argmax(axis=1) == truth
+    losses = -np.log(np.maximum(said[np.arange(len(truth)), truth], np.finfo(float).tiny))
+    sure, right = said.max(axis=1) >= SAID, (said.argmax(axis=1) == truth).astype(float)
+    named = hops & sure
     return {
         "kinds_log_loss": float(clips.by_recording(losses, hops)),
         "kinds_log_loss_prior": float(-(prior * np.log(np.where(prior > 0.0, prior, 1.0))).sum()),
         "said_90": {
             "share": float(clips.by_recording(sure.astype(float), hops)),
-            "right": float(clips.by_recording(right.astype(float), hops & sure))
-            if (hops & sure).any()
-            else None,
+            "right": float(clips.by_recording(right, named)) if named.any() else None,
         },
     }
 
 
 def clip_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the report as text."""
-    kinds = report["kinds"]
-    users = list(next(iter(kinds.values()))["road_users"])
-    lines = [f"{'kind':18}{'recordings':>11}{'familiar':>10}{'foreign':>9}{'signal':>8}  mean probability"]
-    lines.append(" " * 56 + "".join(f"  {name:10}" for name in users) + "  moved by a tilt")
-    for kind, one in kinds.items():
-        told = f"{one['familiar']:10.2f}{one['foreign']:9.2f}{one['signal']:8.2f}"
-        shares = "".join(f"  {share:<10.2f}" for share in one["road_users"].values())
-        lines.append(f"{kind:18}{one['recordings']:11}{told}{shares}  {one['moved_by_tilt']:.3f}")
+    kinds, names = report["kinds"], ("recordings", "familiar", "foreign", "signal")
+    rows = [
+        (kind, *(one[name] for name in names), *one["road_users"].values(), one["moved_by_tilt"])
+        for kind, one in kinds.items()
+    ]
+    heads = ("kind", *names, *next(iter(kinds.values()))["road_users"], "moved by a tilt")
+    lines = Table(
+        "clips", "Shares of the hops, and mean probabilities of the road users", heads, rows
+    ).lines()
     if report["kinds_log_loss"] is None:
         return [*lines, "road users: the table contains none"]
-    said = report["said_90"]
-    right = "-" if said["right"] is None else f"{said['right']:.2f}"
-    losses = (
-        f"log-loss {report['kinds_log_loss']:.3f}, by the table's shares {report['kinds_log_loss_prior']:.3f}"
-    )
+    losses, said = [report["kinds_log_loss"], report["kinds_log_loss_prior"]], report["said_90"]
+    told = "log-loss {:.3f}, by the table's shares {:.3f}".format(*losses)
+    right = cell_text(said["right"])
     return [
         *lines,
-        f"road users: {losses}; probability {SAID} or more in {said['share']:.2f} of the hops, right {right}",
+        f"road users: {told}; probability {SAID} or more in {said['share']:.3f} of the hops, right {right}",
     ]
 
 
@@ -180,9 +176,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     model = read_model(arguments.model)
     if model.guard is None or model.road_users is None:
         raise InvalidArgumentError("--model: expected a model with guard and road users, got one without")
-    with progress_bar(
-        "hearing", 0 if arguments.numbers else len(list(read_rows(arguments.table, ("kind",))))
-    ) as bar:
+    total = 0 if arguments.numbers else len(list(read_rows(arguments.table, ("kind",))))
+    with progress_bar("hearing", total) as bar:
         clips = read_clips(arguments.table, arguments.numbers, bar.advance)
     report = judged(clips, model.guard, model.road_users)
     return CommandResult(report, table={}, lines=clip_lines(report))

@@ -28,13 +28,12 @@ from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate_lab.report.table import plain
+from worldstate_lab.report.table import Cell, Table, Value, plain
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, hear_clips
 from worldstate_lab.signatures.signature_study import (
     IDMT,
     MELAUDIS,
     QUESTIONS,
-    SignatureRow,
     SignatureStudy,
     signature_study,
 )
@@ -43,28 +42,19 @@ from worldstate_lab.signatures.traffic_clips import TrafficClip, idmt_traffic, m
 
 def study_lines(study: SignatureStudy) -> list[str]:
     """Return a table of the measured rows, the worst first, and of the requirements of the others."""
-    filled = [row for row in study.rows if row.value is not None]
-    width = max((len(row.name) for row in filled), default=0)
-    lines = [f"{'':{width}} {'':17} {'value':>6} {'[interval]':15} {'paper':>11} {'clips':>6}  corpus; how"]
-    for row in filled:
-        between = f"[{_number(row.low, row)}, {_number(row.high, row)}]"
-        paper = " - ".join(dict.fromkeys(_number(one, row) for one in row.paper or (None,)))
-        measured = f"{_number(row.value, row):>6} {between:15} {paper:>11}"
-        lines.append(
-            f"{row.name:{width}} {row.figure:17} {measured} {row.n_clips:6}  {row.corpus}; {row.note}"
-        )
+    rows: list[tuple[Cell, ...]] = []
+    for row in study.rows:
+        if row.value is not None:
+            value, low, high = np.array([row.value, row.low, row.high], float).tolist()
+            cell = Value(value, low, high, 0 if row.figure == "Hz" else 3)
+            paper = " - ".join(f"{one:g}" for one in dict.fromkeys(row.paper or ()))
+            rows.append((f"{row.name} ({row.figure})", cell, paper, row.n_clips, f"{row.corpus}; {row.note}"))
+    heads = ("row", "value", "paper", "clips", "corpus; how")
+    lines = Table("signatures", "Vehicles against background", heads, rows).lines()
     for note in dict.fromkeys(row.note for row in study.rows if row.value is None):
-        lines += ["", f"open: {note}"]
-        lines += [
-            f"  {r.name} ({r.figure}, {r.corpus})" for r in study.rows if r.value is None and r.note == note
-        ]
+        needed = [row for row in study.rows if row.value is None and row.note == note]
+        lines += ["", f"open: {note}", *(f"  {row.name} ({row.figure}, {row.corpus})" for row in needed)]
     return lines
-
-
-def _number(value: float | None, row: SignatureRow) -> str:
-    if value is None or np.isnan(value):
-        return "-"
-    return f"{value:.0f}" if row.figure == "Hz" else f"{value:.3f}"
 
 
 Corpora = tuple[ClipSignatures | None, ClipSignatures | None]

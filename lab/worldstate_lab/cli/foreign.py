@@ -109,12 +109,12 @@ def _verdicts(rows: SoundRows, without: Collection[str], kinds: Collection[str])
         one: fit_guard(rows.select((rows.sites != one) & ~np.isin(rows.kinds, list(without))))
         for one in sites
     }
+    out = np.zeros(len(rows.kinds))
     excesses = {
         (one, label): guard.log_odds(rows.measures[(rows.sites == one) & (rows.kinds == label)])
         for one, guard in guards.items()
-        for label in STREET
+        for label in OF_STREETS
     }
-    out = np.zeros(len(rows.kinds))
     for one, guard in guards.items():
         others = [
             np.concatenate([excesses[other, label] for other in sites if other != one])

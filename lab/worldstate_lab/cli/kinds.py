@@ -11,7 +11,7 @@ Examples
 """
 
 import argparse
-from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -29,56 +29,43 @@ from worldstate.commissioning.road_user_training import (
 )
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.checks import in_range
-from worldstate.ground.typing import FloatArray
+from worldstate_lab.report.table import Table, plain
 
 CLIPS_EACH = 20
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RoadUserExam:
-    """Hops near line of sight, at sites outside the training."""
+def road_user_exam(rows: RoadUserRows) -> dict[str, Any]:
+    """Evaluate every site with a model trained without it, kinds as frequent as in a town.
 
-    log_loss: float  # Mean of -ln p of the true class; nats
-    prior_log_loss: float  # The same for the shares of the classes in a town
-    # The largest difference of the two at any site; negative if the model is better everywhere
-    worst_site: float
-    classes: tuple[str, ...]
-    shares: FloatArray  # shape (classes,): Shares in a town, as in the model
-    hops: FloatArray  # shape (classes,): Number
-    confusion: FloatArray  # shape (classes, classes): Mean probability, one row per true class
-    recall: FloatArray  # shape (classes,): Share of hops in which the true class is the likeliest
-    recall_of_equals: FloatArray  # shape (classes,): The same for equally frequent classes
-
-
-def road_user_exam(rows: RoadUserRows) -> RoadUserExam:
-    """Evaluate every site with a model trained without it, kinds as frequent as in a town."""
-    near = rows.select(rows.counts)
-    return _examined(near, cross_validated(rows)[rows.counts], near.weights, town_shares(near))
-
-
-def _examined(near: RoadUserRows, said: FloatArray, weights: FloatArray, shares: FloatArray) -> RoadUserExam:
-    classes = near.classes
-    losses = -np.log(said[np.arange(len(said)), classes])
-    prior = -np.log(shares[classes])
+    The hops are those near line of sight.
+    """
+    near, said = rows.select(rows.counts), cross_validated(rows)[rows.counts]
+    classes, shares = near.classes, town_shares(near)
+    losses, prior = -np.log(said[np.arange(len(said)), classes]), -np.log(shares[classes])
     gains = [
-        float(np.average((losses - prior)[here], weights=weights[here]))
+        float(np.average((losses - prior)[here], weights=near.weights[here]))
         for here in (near.sites == name for name in np.unique(near.sites))
     ]
     # A class without hops has a row of zeros.
-    counts = np.bincount(classes, minlength=len(CLASSES)).astype(np.float64)
+    hops = np.bincount(classes, minlength=len(CLASSES)).astype(np.float64)
     confusion = np.stack([said[classes == number].sum(axis=0) for number in range(len(CLASSES))])
-    hits, equals = (one.argmax(axis=1) == classes for one in (said, said / shares))
-    return RoadUserExam(
-        log_loss=float(np.average(losses, weights=weights)),
-        prior_log_loss=float(np.average(prior, weights=weights)),
-        worst_site=max(gains),
-        classes=CLASSES,
-        shares=shares,
-        hops=counts,
-        confusion=confusion / np.maximum(counts, 1.0)[:, None],
-        recall=np.bincount(classes, hits, len(CLASSES)) / np.maximum(counts, 1.0),
-        recall_of_equals=np.bincount(classes, equals, len(CLASSES)) / np.maximum(counts, 1.0),
+    recall, of_equals = (
+        np.bincount(classes, one.argmax(axis=1) == classes, len(CLASSES)) / np.maximum(hops, 1.0)
+        for one in (said, said / shares)
     )
+    return {
+        "log_loss": float(np.average(losses, weights=near.weights)),  # Mean of -ln p of the true class; nats
+        # The same for the shares of the classes in a town
+        "prior_log_loss": float(np.average(prior, weights=near.weights)),
+        # The largest difference of the two at any site; negative if the model is better everywhere
+        "worst_site": max(gains),
+        "classes": CLASSES,
+        "shares": shares,  # Shares in a town, as in the model
+        "hops": hops,  # Number
+        "confusion": confusion / np.maximum(hops, 1.0)[:, None],  # Mean probability, one row per true class
+        "recall": recall,  # Share of hops in which the true class is the likeliest
+        "recall_of_equals": of_equals,  # The same for equally frequent classes
+    }
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -108,11 +95,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     # junction.
     rows = with_close(rows, close_rows(rate_hz, rng, CLIPS_EACH, jobs))
     found = road_user_exam(rows)
-    report = {name: np.asarray(one).tolist() for name, one in asdict(found).items()}
-    summary = {name: round(getattr(found, name), 3) for name in ("log_loss", "prior_log_loss", "worst_site")}
-    named = zip(found.classes, found.shares, found.hops, found.recall, found.recall_of_equals, strict=True)
-    lines = ["", f"{'class':12}{'share':>7}{'hops':>7}{'recall':>8}{'of equals':>11}  mean probabilities"]
-    for number, (name, share, hops, recall, equals) in enumerate(named):
-        shares = "".join(f"{one:7.2f}" for one in found.confusion[number])
-        lines.append(f"{name:12}{share:7.3f}{hops:7.0f}{recall:8.2f}{equals:11.2f}  {shares}")
-    return CommandResult(report, table=summary, lines=lines)
+    columns = ("classes", "shares", "hops", "recall", "recall_of_equals")
+    rows_of = zip(*(found[name] for name in columns), found["confusion"], strict=True)
+    cells = [(*one, *map(float, probabilities)) for *one, probabilities in rows_of]
+    heads = ("class", "share", "hops", "recall", "of equals", *(f"p({name})" for name in CLASSES))
+    summary = {name: round(found[name], 3) for name in ("log_loss", "prior_log_loss", "worst_site")}
+    lines = ["", *Table("kinds", "Mean probabilities by true class", heads, cells).lines()]
+    return CommandResult(plain(found), table=summary, lines=lines)

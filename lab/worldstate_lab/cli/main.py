@@ -20,34 +20,25 @@ BENCH = "worldstate_lab.cli.bench"
 STUDIES = {
     name: f"worldstate_lab.cli.{name.replace('-', '_')}"
     for name in (
-        "table",
-        "windows",
-        "streams",
-        "scenarios",
-        "left-out",
-        "bearings",
-        "corpora",
-        "planner",
-        "ablations",
-        "realism",
-        "reach",
-        "card",
-        "clips",
-        "foreign",
-        "kinds",
-        "place",
-        "street",
+        *(
+            "table",
+            "windows",
+            "streams",
+            "scenarios",
+            "left-out",
+            "bearings",
+            "corpora",
+            "planner",
+            "realism",
+        ),
+        *("reach", "card", "clips", "foreign", "kinds", "place", "street"),
     )
 }
 CORNER = {
     name: f"worldstate_lab.cli.corner.{name}"
-    for name in ("sequences", "junctions", "staged", "columns", "four")
+    for name in ("sequences", "junctions", "staged", "columns", "four", "ablations")
 }
-BENCHES = {
-    "bench": f"{BENCH}.cost",
-    "bench cost": f"{BENCH}.cost",
-    "bench gospa": f"{BENCH}.gospa",
-}
+BENCHES = {"bench": f"{BENCH}.cost", "bench cost": f"{BENCH}.cost", "bench gospa": f"{BENCH}.gospa"}
 DESCRIPTION = "The evaluation of the paper, and further studies."
 EPILOG = "example: worldstate-lab table --smoke --out smoke"
 GROUPS = {"bench": "costs and accuracies of parts of the library, compared with peers"}

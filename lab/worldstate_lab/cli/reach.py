@@ -24,6 +24,7 @@ Examples
 
 import argparse
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ from worldstate.cli.model.fit import add_group
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.checks import in_range
 from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData, reach_of_array, reach_on_table
-from worldstate_lab.report.table import plain
+from worldstate_lab.report.table import Table, plain
 from worldstate_lab.signatures.clip_signatures import BandProfile, band_profile
 
 # Up to endfire of a transverse array, at which the bound diverges.
@@ -65,7 +66,21 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
     found = {"array": array, "features": data, "bands": bands}
     report = {name: plain(one) for name, one in found.items() if one is not None}
-    return CommandResult(report, table={}, lines=_lines(array, data, bands))
+    columns = np.degrees([array.azimuths_rad, array.std_rad, array.with_vision_rad]).tolist()
+    heads = ("azimuth (deg)", "std (deg)", "with camera", "share")
+    rows = list(zip(*columns, array.endfire.tolist(), strict=True))
+    lines = Table("array", "Smallest deviation of a bearing", heads, rows).lines()
+    if data is not None:
+        lines += ["", *(f"{name:24} {value:.4g}" for name, value in asdict(data).items())]
+    if bands is not None:
+        edges = [f"{low:.0f} - {high:.0f}" for low, high in pairwise(bands.edges_hz)]
+        ratios = zip(edges, bands.by_level.tolist(), bands.by_shape.tolist(), strict=True)
+        lines += [
+            "",
+            *Table("bands", "Fisher ratios", ("band (Hz)", "by level", "by shape"), [*ratios]).lines(),
+        ]
+        lines.append("shape is most informative from {:.0f} to {:.0f} Hz".format(*bands.range_hz))
+    return CommandResult(report, table={}, lines=lines)
 
 
 def _array(arguments: argparse.Namespace) -> ReachOfArray:
@@ -95,20 +110,3 @@ def _bands(arguments: argparse.Namespace) -> BandProfile | None:
     windows = sample_windows(arguments.recordings)[0]
     vehicle = np.array([window.label != "none" for window in windows], dtype=bool)
     return band_profile(track(read_windows(windows), "reading", len(windows)), vehicle)
-
-
-def _lines(array: ReachOfArray, data: ReachOnData | None, bands: BandProfile | None) -> list[str]:
-    lines = [f"{'azimuth':>8} {'std, deg':>10} {'with camera':>12} {'share':>7}"]
-    columns = np.degrees(array.azimuths_rad), np.degrees(array.std_rad), np.degrees(array.with_vision_rad)
-    for azimuth, std, both, share in zip(*columns, array.endfire, strict=True):
-        lines.append(f"{azimuth:8.0f} {std:10.3g} {both:12.3g} {share:7.3f}".replace("inf", "  -"))
-    if data is not None:
-        lines += ["", *(f"{name:24} {value:.4g}" for name, value in asdict(data).items())]
-    if bands is not None:
-        lines += ["", f"{'band, Hz':>16} {'by level':>10} {'by shape':>10}"]
-        for low, high, *ratios in zip(
-            bands.edges_hz[:-1], bands.edges_hz[1:], bands.by_level, bands.by_shape, strict=True
-        ):
-            lines.append(f"{low:7.0f} - {high:6.0f} {ratios[0]:10.3g} {ratios[1]:10.3g}")
-        lines.append("shape is most informative from {:.0f} to {:.0f} Hz".format(*bands.range_hz))
-    return lines

@@ -40,7 +40,7 @@ from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
 from worldstate.ground.errors import InputFileError
 from worldstate.ground.parallel import in_processes
-from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.ground.typing import Float32Array
 from worldstate.ground.values import seconds
 from worldstate.operations.metrics.approach_table import Figures, auroc, mean_of, share_interval
 from worldstate_lab.metrics.intervals import stratified_draws
@@ -63,11 +63,6 @@ class BoardRecording:
     site: str
     side: str
     kind: str
-
-    @property
-    def group(self) -> str:
-        """Site, side and kind."""
-        return f"{self.site} {self.side} {self.kind}"
 
     @property
     def scored(self) -> bool:
@@ -170,7 +165,6 @@ def run_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> d
     persons = [one for one in scored if one.recording.kind in _PERSONS]
     return {
         "by_kind": {name: counts(some) for name, some in _by("kind", scored).items()},
-        "by_group": {name: counts(some) for name, some in _by("group", scored).items()},
         "side": side_figures(cars),
         "hazard": hazard_figures(cars, rng),
         "persons": {"recordings": len(persons), "advisories": sum(one.advised for one in persons)},
@@ -187,14 +181,13 @@ def _by(what: str, outcomes: Sequence[BoardOutcome]) -> dict[str, list[BoardOutc
 
 def counts(outcomes: Sequence[BoardOutcome]) -> Figures:
     """Return the counts of a group: with an advisory, with the correct side, with more hazard at the end."""
-    rises = _rises(outcomes)
+    rises = [one.rise for one in outcomes if one.rise is not None]
     return {
         "count": len(outcomes),
         "hops": sum(one.hops for one in outcomes),
         "advisories": sum(one.advised for one in outcomes),
         "side_right": _right(outcomes),
-        "side_of": len(outcomes),
-        "hazard_higher": int(np.sum(rises > 0.5)),
+        "hazard_higher": sum(one > 0.5 for one in rises),
         "hazard_of": len(rises),
     }
 
@@ -203,61 +196,47 @@ def _right(outcomes: Sequence[BoardOutcome]) -> int:
     return sum(one.side == one.recording.side for one in outcomes)
 
 
-def _rises(outcomes: Sequence[BoardOutcome]) -> FloatArray:
-    return np.array([one.rise for one in outcomes if one.rise is not None])
-
-
 def side_figures(outcomes: Sequence[BoardOutcome]) -> dict[str, Any]:
-    """Return the share of correct sides, with exact intervals, and the mean recall of both sides."""
-    shares = {name: _share(_right(some), len(some)) for name, some in _by("side", outcomes).items()}
-    whole = _share(_right(outcomes), len(outcomes))
-    return {**whole, "balanced": _balanced([one["share"] for one in shares.values()]), "by_side": shares}
-
-
-def _share(count: int, of: int) -> dict[str, Any]:
-    known = {"share": count / of, "interval": share_interval(count, of)} if of else {}
-    return {"right": count, "of": of, "share": None, "interval": None, **known}
-
-
-def _balanced(by_side: Sequence[float]) -> float | None:
-    """Return the mean over both sides, None if one of them was not recorded."""
-    return mean_of(by_side) if len(by_side) == len(SIDES) else None
+    """Return the share of correct sides, with its exact interval, and the mean recall of both sides."""
+    right, of = _right(outcomes), len(outcomes)
+    recalls = [_right(some) / len(some) for some in _by("side", outcomes).values()]
+    return {
+        "right": right,
+        "of": of,
+        "share": right / of if of else None,
+        "interval": share_interval(right, of) if of else None,
+        # If one side was not recorded there is no mean over both.
+        "balanced": mean_of(recalls) if len(recalls) == len(SIDES) else None,
+    }
 
 
 def hazard_figures(outcomes: Sequence[BoardOutcome], rng: np.random.Generator) -> dict[str, Any]:
     """Return the mean over recordings of the AUROC of the last seconds against the first."""
     known = [one for one in outcomes if one.rise is not None]
-    rises = _rises(known)
-    by_side = {name: float(_rises(some).mean()) for name, some in _by("side", known).items()}
-    drawn = (
-        rises[stratified_draws([one.recording.side for one in known], rng)].mean(axis=1) if known else rises
-    )
-    return {
-        "auroc": mean_of(rises),
-        "pairs": len(known),
-        "interval": np.quantile(drawn, _CENTRAL).tolist() if known else None,
-        "higher": int(np.sum(rises > 0.5)),
-        "balanced": _balanced([*by_side.values()]),
-        "by_side": by_side,
-    }
+    rises = np.array([one.rise for one in known], float)
+    interval = None
+    if known:
+        drawn = rises[stratified_draws([one.recording.side for one in known], rng)].mean(axis=1)
+        interval = np.quantile(drawn, _CENTRAL).tolist()
+    return {"auroc": mean_of(rises), "pairs": len(known), "interval": interval}
 
 
 def _lines(title: str, figures: Mapping[str, Any]) -> list[str]:
     names = ("count", "advisories", "side_right", "hazard_higher", "hazard_of")
-    rows = [(group, *(str(one[name]) for name in names)) for group, one in figures["by_group"].items()]
+    rows = [(kind, *(one[name] for name in names)) for kind, one in figures["by_kind"].items()]
     side, hazard, persons = figures["side"], figures["hazard"], figures["persons"]
     return [
         "",
-        *Table("groups", title, ("by site, side and kind", *names), rows).lines(),
-        f"side: {side['right']} of {side['of']}, {_shown(side, 'share')}",
+        *Table("kinds", title, ("by kind", *names), rows).lines(),
+        f"side: {side['right']} of {side['of']}, {_shown(side, 'share')}, "
+        f"mean of both sides {cell_text(side['balanced'])}",
         f"last 2 s against the first 2 s: AUROC {_shown(hazard, 'auroc')}, {hazard['pairs']} recordings",
         f"persons with an advisory: {persons['advisories']} of {persons['recordings']}",
     ]
 
 
 def _shown(figures: Mapping[str, Any], name: str) -> str:
-    known = Value(figures[name], *figures["interval"]).text if figures["interval"] else MISSING
-    return f"{known}, balanced {cell_text(figures['balanced'])}"
+    return Value(figures[name], *figures["interval"]).text if figures["interval"] else MISSING
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
