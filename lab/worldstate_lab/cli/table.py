@@ -271,11 +271,10 @@ def _warnings(found: Evaluation, protocol: str) -> Table:
     """Return the warning figures of every method, with the exact interval of its false alarms."""
     rows: list[tuple[Cell, ...]] = []
     for method, score in found.scores[protocol].items():
-        if not method.startswith("curve"):
-            figures = score.figures()
-            cells = [Value(figures[name], digits=FIGURES[name].digits) for name in SHOWN]
-            rate = Value(figures["false_alarms_per_hour"], *score.poisson(), digits=0)
-            rows.append((method, *cells, rate, Value(score.poisson_upper(), digits=0)))
+        figures = score.figures()
+        cells = [Value(figures[name], digits=FIGURES[name].digits) for name in SHOWN]
+        rate = Value(figures["false_alarms_per_hour"], *score.poisson(), digits=0)
+        rows.append((method, *cells, rate, Value(score.poisson_upper(), digits=0)))
     run = found.runs[protocol]
     heads = ("method", *titles(SHOWN), "false alarms (1/h)", "at most (90 %)")
     return Table("warnings", f"{run.protocol.title}: {run.basis}", heads, rows)

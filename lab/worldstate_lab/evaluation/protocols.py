@@ -180,18 +180,15 @@ GROUNDED: tuple[Method, ...] = (
     CalibratedCue("grounded .02", 0.02, absence=True, evidence="grounded"),
     CalibratedCue("grounded without approach rate .02", 0.02, absence=True, evidence="rateless"),
 )
-# Budgets of the proposed method for the operating curve, in addition to those of the table.
-CURVE_ALPHAS = (0.0, 0.005, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2)
 
 
 def methods_for(trials: Sequence[Trial]) -> tuple[Method, ...]:
     """Return the methods that can be scored on these trials; a chain needs results in every trial."""
     heard = set.intersection(*(set(trial.chains) for trial in trials)) if trials else set()
     refused = refused_methods(trials)
-    curve = tuple(CalibratedCue(f"curve {alpha:g}", alpha) for alpha in CURVE_ALPHAS)
     return tuple(
         method
-        for method in (*METHODS, *GROUNDED, *curve)
+        for method in (*METHODS, *GROUNDED)
         if method.name not in refused and (not isinstance(method, ShippedChain) or method.chain in heard)
     )
 

@@ -49,20 +49,6 @@ COUNTS = (
 _RISK, _RAW = 0, 1
 
 
-@dataclass(frozen=True, slots=True)
-class Scored:
-    """Identity of the recording of one row, by which two evaluations find their shared recordings."""
-
-    name: str
-    label: str
-    site: str
-
-    @classmethod
-    def of(cls, trial: Trial) -> "Scored":
-        """Return the row of a trial."""
-        return cls(trial.name, trial.label, trial.site)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
     """The score of one method under one protocol, once for every seed that changes its decisions.
@@ -71,8 +57,8 @@ class Score:
 
     Parameters
     ----------
-    recordings : tuple of Scored
-        In the order of the rows.
+    strata : tuple of (str, str)
+        Label and site of every recording, in the order of the rows; the strata of `stratified_draws`.
     counts : mapping of str to ndarray, shape (S, R)
         Sums over the hops of each recording.
     wins : ndarray, shape (S, horizons, P, Q)
@@ -96,7 +82,7 @@ class Score:
     (1.0, 0.5, 1800)
     """
 
-    recordings: tuple[Scored, ...]
+    strata: tuple[tuple[str, str], ...]
     counts: Mapping[str, FloatArray]
     wins: FloatArray
     bins: FloatArray
@@ -117,26 +103,21 @@ class Score:
             passes = passes[:1]
         rows = [_counts(trials, said) for said in passes]
         return cls(
-            recordings=tuple(map(Scored.of, trials)),
+            strata=tuple((trial.label, trial.site) for trial in trials),
             counts={name: np.array([[one[name] for one in row] for row in rows]) for name in COUNTS},
             wins=np.array([_wins(trials, said) for said in passes]),
             bins=np.array([_bins(trials, said) for said in passes]),
             bearings=tuple(_bearings(trials, said) for said in passes),
         )
 
-    @property
-    def draw_strata(self) -> list[tuple[str, str]]:
-        """Label and site of every recording, the strata of `stratified_draws`."""
-        return [(one.label, one.site) for one in self.recordings]
-
     def figures(self, rows: IndexArray | None = None) -> dict[str, float]:
         """Return every figure on the chosen recordings, mean over seeds; NaN if there is nothing to count."""
-        chosen = np.arange(len(self.recordings)) if rows is None else rows
+        chosen = np.arange(len(self.strata)) if rows is None else rows
         return {name: float(values[0]) for name, values in self.draws(chosen[None]).items()}
 
     def draws(self, draws: IndexArray) -> dict[str, FloatArray]:
         """Return every figure on each draw of recordings, mean over seeds, shape (D,); draws (D, n)."""
-        return self._values(draw_weights(draws, len(self.recordings)))
+        return self._values(draw_weights(draws, len(self.strata)))
 
     def intervals(self, draws: IndexArray) -> dict[str, Interval]:
         """Return the central 95 % of every figure over draws, and the exact interval of the false alarms."""
@@ -163,8 +144,8 @@ class Score:
 
     def by_site(self) -> dict[str, dict[str, float]]:
         """Return the figures of each junction, by name."""
-        sites = sorted({one.site for one in self.recordings})
-        inside = np.array([[one.site == site for one in self.recordings] for site in sites], np.float64)
+        sites = sorted({site for _, site in self.strata})
+        inside = np.array([[one == site for _, one in self.strata] for site in sites], np.float64)
         found = self._values(inside)
         return {
             site: {name: float(values[i]) for name, values in found.items()} for i, site in enumerate(sites)
@@ -182,7 +163,7 @@ class Score:
 
     @property
     def _free(self) -> BoolArray:
-        return np.array([one.label == "none" for one in self.recordings])
+        return np.array([label == "none" for label, _ in self.strata])
 
     def _values(self, weights: FloatArray) -> dict[str, FloatArray]:
         """Return every figure with weight weights[d, r] for recording r, shape (D,)."""
@@ -245,17 +226,6 @@ class Score:
             onsets, windows_s = np.floor(sums["onsets_before"][s]), self.counts["window_s"][s]
             rates[s, scored] = random_detection(windows_s, onsets[scored], before_s[scored], times[scored])
         return rates
-
-
-def paired(ours: Score, other: Score, draws: IndexArray) -> dict[str, tuple[float, float, float]]:
-    """Return our value minus the other for every figure, with the central 95 % on the same draws."""
-    if ours.recordings != other.recordings:
-        raise InvalidArgumentError("scores: expected two methods on the same recordings in the same order")
-    every = np.vstack([np.arange(len(ours.recordings)), draws])
-    a, b = ours.draws(every), other.draws(every)
-    # Both methods fail on the same hard recordings. These errors cancel only if both use the same draws.
-    gains = {name: a[name] - b[name] for name in a}
-    return {name: (float(gain[0]), *middle(gain[1:])) for name, gain in gains.items()}
 
 
 def _counts(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[dict[str, float]]:

@@ -263,7 +263,7 @@ def _rows(run: ProtocolRun, path: Heard, rng: np.random.Generator) -> dict[str, 
 def _window_figures(run: ProtocolRun, method: str, rng: np.random.Generator) -> dict[str, Row]:
     """Return AUROC by horizon before T0, and ECE of the raw score and of the risk over five folds."""
     score = Score.of(run.trials, run.decisions[method])
-    draws = stratified_draws(score.draw_strata, rng)
+    draws = stratified_draws(score.strata, rng)
     drawn = score.draws(np.vstack([np.arange(len(run.trials)), draws]))
     horizons = {name: with_interval(name, drawn[f"auroc_{name}"]) for name in WINDOWS_S}
     risk = {name: with_interval(name, drawn[name]) for name in ("ece_raw", "ece")}

@@ -12,19 +12,13 @@ import sklearn
 from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
-from worldstate_lab.evaluation.protocols import GROUNDED, PROTOCOLS, STANDING, Protocol
+from worldstate_lab.evaluation.protocols import PROTOCOLS, STANDING, Protocol
 from worldstate_lab.report.table import Cell, Document, Section, Table, Value
 from worldstate_lab.trials.pass_cache import data_fingerprint
 
 from .degradation_section import awareness_figures, degradation_section, sweep_values
 from .measured_values import PROPOSED, MeasuredValues, printed, site_values
-from .warning_sections import (
-    budget_section,
-    cueing_section,
-    difference_section,
-    table_i,
-    tracking_section,
-)
+from .warning_sections import cueing_section, table_i, tracking_section
 
 _UNMEASURED = "not measured"
 _TRANSFER = (
@@ -34,14 +28,8 @@ _TRANSFER = (
 _BY_SITE = (
     *("hazard_free_hours", "detection", "random_detection", "lead_s", "false_alarms_per_hour", "auroc_all"),
 )
-# The removed part, and the row without it.
-_ABLATIONS = (
-    ("everything on", "with absence .02", "ece"),
-    ("(a) without absence", PROPOSED, "ece"),
-    ("(b) raw statistic read as risk", "with absence .02", "ece_raw"),
-    ("with looming, weight from the calibration folds", "with absence .02 + looming", "ece"),
-)
-_ABLATED = ("detection", "random_detection", "lead_s", "false_alarms_per_hour", "auroc_all")
+
+
 # Groups of the paper's values whose row names are complete labels.
 _NAMED_BY_ROW = ("array bounds", "signature study", "data", "real time")
 
@@ -107,40 +95,6 @@ def _junction_table(found: Evaluation) -> Table:
     )
 
 
-def ablation_section(measured: MeasuredValues) -> Section:
-    """Return the section on ablations (a) and (b), looming, and approach rate in the grounded likelihood."""
-
-    def cell(row: str, figure: str) -> Value:
-        # The reference here is the row of Table I and not the paper's value.
-        return replace(measured.at(STANDING, row, figure, note=_UNMEASURED), paper=None)
-
-    shown = (*_ABLATED, "ece", "hazard_awareness")
-    table = Table(
-        "ablations",
-        "Ablations, standing ego",
-        ("part", *titles(shown)),
-        [
-            (part, *(cell(row, figure) for figure in (*_ABLATED, error, "hazard_awareness")))
-            for part, row, error in _ABLATIONS
-        ],
-        f"{measured.found.runs[STANDING].basis} One part is switched off at a time, on the same folds; the "
-        f"hazard awareness of vision alone is {cell('Vision-only', 'hazard_awareness').text}. Paper: (a) "
-        "changes no entry of Table I with a clean camera; (b) ECE 0.167 raw, 0.034 calibrated; (c) is the "
-        "section on degradation.",
-    )
-    names = {one.name for one in GROUNDED}
-    grounded = measured.table(
-        STANDING,
-        [name for name in measured.methods(STANDING) if name in names],
-        _TRANSFER,
-        "grounded",
-        "Bearing and approach rate in the likelihood, eq. (5)",
-        "The shipped scores alone, weighted by bearing and approach rate, and without the approach rate. The "
-        "paper calls the last ablation vacuous, because tonal Doppler is rarely usable.",
-    )
-    return Section("Ablations", (), (table, grounded))
-
-
 def paper_section(measured: MeasuredValues) -> Section:
     """Return every number of the paper beside ours, with the command and the data that compute it."""
     simulated = measured.found.takes.simulated
@@ -185,13 +139,11 @@ def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, st
     static = STANDING in found.runs
     sections = [
         _data_section(found),
-        *((table_i(measured), budget_section(measured)) if static else ()),
-        *((cueing_section(measured, panels),) if static else ()),
+        *((table_i(measured), cueing_section(measured, panels)) if static else ()),
         front_end_section(measured),
         transfer_section(measured),
         degradation_section(found.degradation, found.lacking.get("degradation sweep", "not requested")),
-        *(section(measured) for section in (ablation_section, tracking_section) if static),
-        difference_section(found),
+        *((tracking_section(measured),) if static else ()),
         paper_section(measured),
     ]
     return Document(

@@ -50,9 +50,8 @@ class MeasuredValues:
         values = dict(others) | dict(_data_values(found)) | dict(_array_values())
         for protocol, scores in found.scores.items():
             for method, score in scores.items():
-                if not method.startswith("curve"):
-                    figures = score_values(score, found, protocol)
-                    values |= {(protocol, method, name): value for name, value in figures.items()}
+                figures = score_values(score, found, protocol)
+                values |= {(protocol, method, name): value for name, value in figures.items()}
         if found.front_end is not None:
             values |= dict(_front_end_values(found.front_end))
         values |= dict(_derived_values(values, found))
@@ -65,8 +64,7 @@ class MeasuredValues:
 
     def methods(self, protocol: str, figures: Iterable[str] = ()) -> list[str]:
         """Return the methods with a row in the report; given figures, only methods with any of them."""
-        scored = [name for name in self.found.scores[protocol] if not name.startswith("curve")]
-        every = [*scored, *self.found.refused.get(protocol, {})]
+        every = [*self.found.scores[protocol], *self.found.refused.get(protocol, {})]
         if not figures:
             return every
         return [m for m in every if any(math.isfinite(self.at(protocol, m, one).value) for one in figures)]
@@ -110,7 +108,7 @@ def score_values(score: Score, found: Evaluation, protocol: str) -> dict[str, Va
 
 def _worst_notes(score: Score) -> dict[str, str]:
     """Return the worst junction of every figure, or nothing if there is only one junction."""
-    if len({one.site for one in score.recordings}) < 2:
+    if len({site for _, site in score.strata}) < 2:
         return {}
     return {
         name: f"worst {site} {Value(value, digits=FIGURES[name].digits).number}"
@@ -122,8 +120,8 @@ def _worst_notes(score: Score) -> dict[str, str]:
 def site_values(score: Score, found: Evaluation, protocol: str) -> dict[str, dict[str, Value]]:
     """Return the figures of each junction with intervals over its recordings."""
     sites: dict[str, list[int]] = {}
-    for row, one in enumerate(score.recordings):
-        sites.setdefault(one.site, []).append(row)
+    for row, (_, site) in enumerate(score.strata):
+        sites.setdefault(site, []).append(row)
     values = {}
     for site, rows in sorted(sites.items()):
         # Element i of every draw comes from the stratum of recording i, so it has the junction of recording

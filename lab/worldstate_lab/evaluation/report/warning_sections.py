@@ -1,18 +1,16 @@
-"""Sections on warnings: Table I, budgets and false alarms, calibrated cueing, one approach, differences."""
+"""Sections on warnings: Table I, calibrated cueing, tracks."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import FIGURES, titles
-from worldstate_lab.evaluation.protocols import CURVE_ALPHAS, STANDING
+from worldstate_lab.evaluation.protocols import STANDING
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
-from worldstate_lab.evaluation.scores import paired
 from worldstate_lab.report.table import Cell, Figure, Section, Table, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
-from .measured_values import PROPOSED, MeasuredValues, score_values
+from .measured_values import PROPOSED, MeasuredValues
 from .panels import OperatingPoint, operating_figure, reliability_figure, roc_figure
 
 _BUDGETS = {f"proposed {text}": float(text) for text in (".01", ".02", ".05")}
@@ -24,18 +22,6 @@ _WARNING = (
 _AREAS = ("auroc_all", "auroc_2s", "auroc_1s")
 _CALIBRATION = (*_AREAS, "ece", "ece_floor", "ece_raw", "brier_skill", "hazard_share")
 _TRACKING = ("gospa_deg", "visible_error_s", "visible_error_constant_s", "visible_coverage")
-_BUDGET = ("false_alarms_per_hour", "detection", "random_detection", "lead_s")
-_PAIRS = (
-    (PROPOSED, "published, sustained"),
-    (PROPOSED, "published"),
-    ("proposed .02 + looming", PROPOSED),
-    ("with absence .02", PROPOSED),
-    ("ensemble .02", "with absence .02"),
-    ("shipped model", PROPOSED),
-    ("+ site adaptation", "shipped model"),
-    ("world-state advisory", "+ site adaptation"),
-)
-_COMPARED = ("detection", "lead_s", "false_alarms_per_hour", "auroc_all", "ece", "gospa_deg")
 
 
 def table_i(measured: MeasuredValues) -> Section:
@@ -61,30 +47,7 @@ def table_i(measured: MeasuredValues) -> Section:
         f"Vision only: a moving box precedes T0 in {early.number} {early.note} approaches (paper: 3 of 42, "
         "attributed to the tolerance of the T0 annotation and printed as 0).",
     )
-    return Section("Table I", text, (table,))
-
-
-def budget_section(measured: MeasuredValues) -> Section:
-    """Return the section on false alarms per hour as a function of alpha (section VII of the paper)."""
-    rows: list[tuple[Cell, ...]] = []
-    budgets = {alpha: method for method, alpha in _BUDGETS.items()}
-    for alpha in CURVE_ALPHAS:
-        score = measured.found.scores[STANDING].get(f"curve {alpha:g}")
-        if score is not None:
-            curve = score_values(score, measured.found, STANDING)
-            curve |= {
-                name: measured.at(STANDING, budgets[alpha], name) for name in _BUDGET if alpha in budgets
-            }
-            rows.append((f"{alpha:g}", *(curve[name] for name in _BUDGET)))
-    table = Table(
-        "alpha",
-        "Budget and achieved false alarms, proposed method",
-        ("alpha (share of windows)", *titles(_BUDGET)),
-        rows,
-        f"{measured.found.runs[STANDING].basis} alpha bounds the share of hazard-free windows in alarm on "
-        "the calibration folds; the alarms per hour are counted on the test folds. Intervals as in Table I.",
-    )
-    return Section("Budget and false alarms", (), (table, equal_table(measured.found, STANDING)))
+    return Section("Table I", text, (table, equal_table(measured.found, STANDING)))
 
 
 def equal_table(found: Evaluation, protocol: str) -> Table:
@@ -177,24 +140,3 @@ def tracking_section(measured: MeasuredValues) -> Section:
         "compared with the constant that fits best, which is computed from these approaches.",
     )
     return Section("Tracking measures", (), (table,))
-
-
-def difference_section(found: Evaluation) -> Section:
-    """Return paired differences between methods, on the same draws of recordings."""
-    rows: list[tuple[Cell, ...]] = []
-    for protocol, scores in found.scores.items():
-        for ours, other in _PAIRS:
-            if ours in scores and other in scores:
-                gains = paired(scores[ours], scores[other], found.draws[protocol])
-                cells = [Value(*gains[figure], FIGURES[figure].digits) for figure in _COMPARED]
-                run = found.runs[protocol]
-                rows.append((run.protocol.title, str(len(run.trials)), f"{ours} less {other}", *cells))
-    table = Table(
-        "differences",
-        "Differences between methods",
-        ("protocol", "recordings", "difference", *titles(_COMPARED)),
-        rows,
-        "First method minus the second on the same recordings, with the central 95 % over the same draws: "
-        "if an interval excludes 0, these recordings show a difference.",
-    )
-    return Section("Paired differences", (), (table,))
