@@ -30,11 +30,7 @@ from worldstate_lab.degradation.conditions import (
     rained,
 )
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
-from worldstate_lab.degradation.staged_filter import (
-    by_condition,
-    cameras,
-    filter_in_conditions,
-)
+from worldstate_lab.degradation.staged_filter import Camera, by_condition, filter_in_conditions
 from worldstate_lab.evaluation.report.degradation_section import (
     degradation_record,
     sweep_tables,
@@ -207,7 +203,7 @@ def test_counts_are_those_of_measure_absence(approach, video):
 @pytest.mark.long
 def test_beta_rises_with_a_failing_camera_while_the_sound_is_unchanged(approach, looks, rates):
     source, seed = open_source(approach.folder), (0, 1)
-    behind = cameras(MOTION, {"mog2": rates}, looks)
+    behind = [Camera(MOTION[0], rates, looks["mog2"], looks[READINGS])]
     loud = Condition("lens", 4), Condition("roof", 3), Condition("rain", 4)
     conditions = (Condition(CLEAN), Condition("noise", 4), *loud, Condition(OFF))
     staged = by_condition(filter_in_conditions(source, behind, seed, conditions)["mog2"])

@@ -23,7 +23,7 @@ from worldstate_lab.passes.followed_stream import (
     stream_measurements,
 )
 from worldstate_lab.passes.pass_outcomes import (
-    above_place_db,
+    above_quiet_db,
     added_db,
     level_db,
     pass_figures,
@@ -243,7 +243,7 @@ def test_the_meter_measures_decibels_above_the_earlier_level() -> None:
     louder = made_up.hops.middle.copy()
     louder[300:320] *= 10
     hops = made_up.hops.replace(middle=louder)
-    above = above_place_db(replace(made_up, hops=hops))
+    above = above_quiet_db(level_db(replace(made_up, hops=hops)))
     assert np.abs(above[50:300]).max() < 2.0
     assert above[305:320] == pytest.approx(np.full(15, 20.0), abs=2.0)
     # After the burst the quiet level is the same as before: a fifth of the past is below either.

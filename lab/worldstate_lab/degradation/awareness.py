@@ -19,15 +19,14 @@ from worldstate.operations.metrics.approach_table import (
     rising_edges,
 )
 from worldstate.operations.recordings.hop_table import HOP_S, UNQUERIED, HopTable
-from worldstate_lab.metrics.intervals import deal_folds, middle, ratio
+from worldstate_lab.metrics.intervals import deal_folds, middle, pooled_share
 from worldstate_lab.metrics.stream_statistic import stream_statistic
 
 from .conditions import CLEAN, LENS, OFF, RAIN, RAIN_DB, ROOF, Condition, all_conditions
 
 # One recording by name of the condition, with the columns of `staged_filter.filter_in_conditions`.
 Staged = Mapping[str, HopTable]
-
-
+Share = tuple[float, FloatArray]  # Over all recordings, and in every draw of them
 # Share of hazard-free windows in alarm.
 ALPHA = 0.02
 
@@ -122,10 +121,10 @@ def hazard_awareness(
         state.name: [judges[fold](one[state.name]) for one, fold in zip(recordings, folds, strict=True)]
         for state in all_conditions()
     }
-    counts = {name: _Counts(found, draws) for name, found in judged.items()}
+    shares = {name: _shares(found, draws) for name, found in judged.items()}
     return Awareness(
-        tuple(_row(state, judged[state.name], counts[state.name]) for state in all_conditions()),
-        tuple(_common_cause(level, counts) for level in range(1, len(LEVELS))),
+        tuple(_row(state, judged[state.name], *shares[state.name]) for state in all_conditions()),
+        tuple(_common_cause(level, shares) for level in range(1, len(LEVELS))),
         int(sum(one.after_sight().sum() for one in clean)),
         _hours(judged[CLEAN]),
     )
@@ -154,27 +153,11 @@ class _Judged:
         return np.asarray(flags[self.recording.after_sight()])
 
 
-class _Counts:
-    """Numbers of all, detected and aware hops after T0 of every recording; gives shares for any draw."""
-
-    def __init__(self, judged: Sequence[_Judged], draws: IndexArray) -> None:
-        flags = [(one.in_sight(one.recording.found), one.in_sight(one.aware)) for one in judged]
-        self._hops = np.array([found.size for found, _ in flags], dtype=float)
-        self._found, self._aware = np.array([[f.sum(), a.sum()] for f, a in flags], dtype=float).T
-        self._draws = draws
-
-    def vision(self) -> tuple[float, FloatArray]:
-        """Share of detected hops, over all recordings and in every draw."""
-        return self._share(self._found)
-
-    def awareness(self) -> tuple[float, FloatArray]:
-        """Share of aware hops, over all recordings and in every draw."""
-        return self._share(self._aware)
-
-    def _share(self, part: FloatArray) -> tuple[float, FloatArray]:
-        hops, drawn = self._hops[self._draws].sum(axis=1), part[self._draws].sum(axis=1)
-        # A draw without a vehicle in view has no share; `middle` leaves it out.
-        return float(part.sum() / self._hops.sum()), ratio(drawn, hops)
+def _shares(judged: Sequence[_Judged], draws: IndexArray) -> tuple[Share, Share]:
+    """Return the shares of detected and of aware hops after T0."""
+    flags = [(one.in_sight(one.recording.found), one.in_sight(one.aware)) for one in judged]
+    hops, found, aware = np.array([[f.size, f.sum(), a.sum()] for f, a in flags], np.float64).T
+    return pooled_share(found, hops, draws), pooled_share(aware, hops, draws)
 
 
 def _judge(others: Sequence[Staged], prior: Sequence[float], hops: int) -> Callable[[HopTable], _Judged]:
@@ -191,7 +174,7 @@ def _judge(others: Sequence[Staged], prior: Sequence[float], hops: int) -> Calla
     return judge
 
 
-def _row(state: Condition, judged: Sequence[_Judged], counts: _Counts) -> AwarenessRow:
+def _row(state: Condition, judged: Sequence[_Judged], vision: Share, awareness: Share) -> AwarenessRow:
     free = [one for one in judged if one.recording.hazard_free]
     outcomes = [
         onset_outcome(one.recording.time_s[rising_edges(one.alarm)], one.recording.t0_s)
@@ -205,9 +188,9 @@ def _row(state: Condition, judged: Sequence[_Judged], counts: _Counts) -> Awaren
         condition=state,
         degradation=float(np.mean([one.recording.degradation.mean() for one in judged])),
         miss_rate=mean_of(np.concatenate([_asked_miss_rates(one.recording) for one in judged])),
-        vision=_estimate(*counts.vision()),
+        vision=_estimate(*vision),
         any_detection=float(seen.mean()),
-        awareness=_estimate(*counts.awareness()),
+        awareness=_estimate(*awareness),
         unseen_awareness=mean_of(heard[~found]),
         detected=float(np.mean([one.detected for one in outcomes])),
         lead_time_s=mean_of([one.lead_s for one in outcomes if one.detected]),
@@ -217,10 +200,11 @@ def _row(state: Condition, judged: Sequence[_Judged], counts: _Counts) -> Awaren
     )
 
 
-def _common_cause(level: int, counts: Mapping[str, _Counts]) -> CommonCause:
+def _common_cause(level: int, shares: Mapping[str, tuple[Share, Share]]) -> CommonCause:
     names = (CLEAN, *(Condition(family, level).name for family in (LENS, ROOF, RAIN)))
-    shares = [counts[name].awareness() for name in names]
-    clean, lens, roof, rain = (np.array([value, *drawn]) for value, drawn in shares)
+    clean, lens, roof, rain = (
+        np.array([value, *drawn]) for _, (value, drawn) in map(shares.__getitem__, names)
+    )
     additive = np.clip(lens + roof - clean, 0.0, 1.0)
     figures = (lens, roof, rain, additive, additive - rain)
     return CommonCause(level, RAIN_DB[level], *(_estimate(float(one[0]), one[1:]) for one in figures))

@@ -1,7 +1,7 @@
 """Miss rates of a detector over azimuth and degradation, with intervals over recordings."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from operator import add
@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from worldstate.adapters.camera.camera_health import LEVELS
+from worldstate.adapters.camera.camera_health import LEVELS, Family
 from worldstate.adapters.camera.detections import DetectionLog
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, as_tuples
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -79,13 +79,20 @@ class BetaCurves:
 def absence_counts(reference: DetectionLog, boxes: HopTable) -> dict[str, FamilyCounts]:
     """Count the misses of a detector against the reference of one recording, in every condition."""
     tally = AbsenceTally(PinholeCamera.ovad(), SETTINGS)
-    for family in FAMILIES:
-        for level in range(len(LEVELS)):
-            # The clean camera belongs to every family but is counted once.
-            if level or family == FAMILIES[0]:
-                for number, found in enumerate(detections_in(boxes, at_level(family, level).name).frames):
-                    tally.count(reference, number, found, family, level)
+    for family, level in staged_levels():
+        for number, found in enumerate(detections_in(boxes, at_level(family, level).name).frames):
+            tally.count(reference, number, found, family, level)
     return tally.counts()
+
+
+def staged_levels() -> list[tuple[Family, int]]:
+    """Return every level of every family; the clean camera belongs to all of them but is counted once."""
+    return [(one, level) for one in FAMILIES for level in range(one != FAMILIES[0], len(LEVELS))]
+
+
+def pooled(counts: Sequence[Counts]) -> dict[str, FamilyCounts]:
+    """Return the counts of several recordings together."""
+    return {family: reduce(add, [one[family] for one in counts]) for family in FAMILIES}
 
 
 def counts_table(counts: Counts) -> HopTable:
@@ -112,13 +119,9 @@ def pooled_rates(
     counts: Sequence[Counts], readings: Sequence[HopTable], provenance: Mapping[str, str]
 ) -> MissRates:
     """Return the miss rates of several recordings together, with the health scale of their camera."""
-    families: dict[str, FamilyCounts] = {
-        family: reduce(add, [one[family] for one in counts]) for family in FAMILIES
-    }
+    families = pooled(counts)
     if not np.sum(families[FAMILIES[0]].looks):
-        raise InvalidArgumentError(
-            "recordings: expected moving objects in view, found none to measure beta on"
-        )
+        raise InvalidArgumentError("recordings: expected moving objects in view to measure beta on")
     edges = SETTINGS.edges_deg(PinholeCamera.ovad())
     return MissRates(edges, families, provenance, health_of(readings), REPEATS)
 
@@ -138,30 +141,24 @@ def beta_curves(counts: Sequence[Counts], draws: IndexArray) -> BetaCurves:
     overall = _band(ratio(missed.sum(axis=1), total.sum(axis=1)), drawn_all)
     found = BetaCurves(edges, total, by_azimuth, overall, ())
     falls = sorted(_falls(found, drawn_bins, drawn_all), key=lambda fall: -fall.by)
-    return BetaCurves(edges, total, by_azimuth, overall, tuple(falls))
+    return replace(found, falls=tuple(falls))
 
 
-def _falls(curves: BetaCurves, drawn_bins: FloatArray, drawn_all: FloatArray) -> Iterable[Fall]:
+def _falls(curves: BetaCurves, drawn_bins: FloatArray, drawn_all: FloatArray) -> Iterator[Fall]:
     for i, family in enumerate(FAMILIES):
-        for level in range(1, len(LEVELS)):
-            where = f"{family} {LEVELS[level - 1]:g} to {LEVELS[level]:g}"
-            step = drawn_all[:, i, level - 1] - drawn_all[:, i, level]
-            by = curves.overall.value[i, level - 1] - curves.overall.value[i, level]
-            yield from _fall("degradation", where, by, step)
-        for level in range(0 if i == 0 else 1, len(LEVELS)):
-            beta = curves.by_azimuth.value[i, :, level]
-            known = np.flatnonzero(curves.looks[i, :, level] >= FEWEST_LOOKS)
-            for a, b in pairwise(known):
+        by = -np.diff(curves.overall.value[i])
+        for level in np.flatnonzero(by > 0.0).tolist():
+            where = f"{family} {LEVELS[level]:g} to {LEVELS[level + 1]:g}"
+            drawn = drawn_all[:, i, level] - drawn_all[:, i, level + 1]
+            yield Fall("degradation", where, float(by[level]), *middle(drawn))
+    for family, level in staged_levels():
+        i = FAMILIES.index(family)
+        beta = curves.by_azimuth.value[i, :, level]
+        for a, b in pairwise(np.flatnonzero(curves.looks[i, :, level] >= FEWEST_LOOKS)):
+            if beta[a] > beta[b]:
                 where = f"{at_level(family, level).name}, {curves.bins[a]} to {curves.bins[b]}"
-                step = drawn_bins[:, i, a, level] - drawn_bins[:, i, b, level]
-                yield from _fall("azimuth", where, beta[a] - beta[b], step)
-
-
-def _fall(
-    along: Literal["degradation", "azimuth"], where: str, by: float, drawn: FloatArray
-) -> Iterable[Fall]:
-    if by > 0.0:
-        yield Fall(along, where, float(by), *middle(drawn))
+                drawn = drawn_bins[:, i, a, level] - drawn_bins[:, i, b, level]
+                yield Fall("azimuth", where, float(beta[a] - beta[b]), *middle(drawn))
 
 
 def _band(value: FloatArray, drawn: FloatArray) -> Band:

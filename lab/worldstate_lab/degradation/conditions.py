@@ -275,8 +275,9 @@ def look(
                     found = makers[name, state].detect(staged)
                     rows += ((state.name, number, *box) for box in _reported(found, small))
                 if number % period == 0:
-                    quality = image_quality(state.stage(_centre(frame), rng))
-                    readings.append((state.name, number / rate_hz, *_measures(quality)))
+                    read = image_quality(state.stage(_centre(frame), rng))
+                    sharpness = np.nan if read.sharpness is None else read.sharpness
+                    readings.append((state.name, number / rate_hz, read.brightness, read.noise, sharpness))
     about = {"frames": number + 1, "frame_rate_hz": rate_hz}
     tables = {name: HopTable.of_rows(_BOX_COLUMNS, rows).replace(about=about) for name, rows in boxes.items()}
     return {**tables, READINGS: HopTable.of_rows(_READING_COLUMNS, readings)}
@@ -288,11 +289,6 @@ def _reported(found: DetectionFrame, image: ImageArray) -> Iterator[tuple[FloatA
     whole = PinholeCamera.ovad()
     scale = np.array([whole.width_px / width, whole.height_px / height] * 2)
     return zip(found.boxes_px * scale, found.scores.tolist(), found.labels, strict=True)
-
-
-def _measures(quality: ImageQuality) -> tuple[float, float, float]:
-    sharpness = np.nan if quality.sharpness is None else quality.sharpness
-    return quality.brightness, quality.noise, sharpness
 
 
 def detections_in(looks: HopTable, condition: str) -> DetectionLog:

@@ -17,7 +17,7 @@ from worldstate.adapters.source import open_source
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
-from worldstate.ground.typing import BoolArray, IndexArray
+from worldstate.ground.typing import BoolArray
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.degradation import conditions, staged_filter
 from worldstate_lab.metrics.intervals import deal_folds, stratified_draws
@@ -33,7 +33,7 @@ from .beta_curves import (
     pooled_rates,
 )
 from .conditions import FAMILIES, RAIN_DB, READINGS, StagedDetector, look, motion_detectors
-from .staged_filter import by_condition, cameras, filter_in_conditions
+from .staged_filter import Camera, by_condition, filter_in_conditions
 
 # Minimum of each kind: with fewer, no recording remains on which to set thresholds and miss rates.
 LEAST = 2
@@ -289,7 +289,8 @@ def degradation_study(
     rng, skipped = np.random.default_rng(chosen.seed), dict[str, str]()
     seen = _done(over, passes.look, [SweepItem(one) for one in data.recordings], skipped)
     counts = [{name: counts_of(one.tables[f"{name} misses"]) for name in passes.names} for one in seen]
-    folds = _folds(seen, rng)
+    sites = [str(one.recording.environment) for one in seen]
+    folds = deal_folds([str(one.recording.label) for one in seen], sites, rng)
     rates = {fold: passes.rates(folds != fold, seen, counts) for fold in set(folds.tolist())}
     items = [replace(one, rates=rates[fold]) for one, fold in zip(seen, folds.tolist(), strict=True)]
     believed = _done(over, passes.filter, items, skipped)
@@ -362,17 +363,15 @@ class _Passes:
         """Return the beliefs of the filter in every condition, one table per detector."""
         recording, model = item.recording, read_model(self.settings.model)
         rates = {name: one.to_dict() for name, one in item.rates.items()}
-        key = [
-            staged_filter.VERSION,
-            self._look_key(item),
-            rates,
-            encode(model),
-            list(map(repr, RAIN_DB)),
-        ]
+        key = [staged_filter.VERSION, self._look_key(item), rates, encode(model), list(map(repr, RAIN_DB))]
 
         def make() -> Tables:
             source = open_source(recording.path, model=model)
-            seen = cameras(self.settings.detectors, item.rates, item.tables)
+            tables = item.tables
+            seen = [
+                Camera(one, item.rates[one.name], tables[one.name], tables[READINGS])
+                for one in self.settings.detectors
+            ]
             about: dict[str, Any] = {
                 "name": recording.recording_id,
                 "label": recording.label,
@@ -415,8 +414,3 @@ def _done(
         else:
             done.append(replace(item, tables=tables))
     return done
-
-
-def _folds(seen: Sequence[SweepItem], rng: np.random.Generator) -> IndexArray:
-    labels = [str(one.recording.label) for one in seen]
-    return deal_folds(labels, [str(one.recording.environment) for one in seen], rng)

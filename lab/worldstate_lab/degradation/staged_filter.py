@@ -1,7 +1,7 @@
 """Filter results on recordings in staged states: dry or rainy sound, clean or degraded camera."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,11 +9,7 @@ import numpy as np
 from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.camera.box_linking import overlaps
 from worldstate.adapters.camera.camera_health import DegradationLog
-from worldstate.adapters.camera.detections import (
-    DetectionFilter,
-    DetectionLog,
-    kept_and_parked,
-)
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, kept_and_parked
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.vision_query import MAX_IMAGE_AGE_S, VisionQuery
 from worldstate.adapters.listener import measure_steps
@@ -28,7 +24,6 @@ from worldstate.operations.recordings.hop_table import HopTable, hop_stream, joi
 
 from .conditions import (
     OFF,
-    READINGS,
     Condition,
     StagedDetector,
     all_conditions,
@@ -53,22 +48,11 @@ class Camera:
 
     def look(self, source: Source, images: str, d: DegradationLog) -> VisionQuery:
         """Return the channel to be queried in a condition of the camera."""
+        seen, sector = detections_in(self.boxes, images), unoccluded_sector(source.context)
+        rates = self.rates
         return VisionQuery(
-            source.camera,
-            detections_in(self.boxes, images),
-            self.rates.table,
-            d,
-            self.detector.keep,
-            unoccluded_sector(source.context),
-            self.rates.clutter_rate,
+            source.camera, seen, rates.table, d, self.detector.keep, sector, rates.clutter_rate
         )
-
-
-def cameras(
-    detectors: Iterable[StagedDetector], rates: Mapping[str, MissRates], looks: Mapping[str, HopTable]
-) -> list[Camera]:
-    """Return every detector with its detections in one recording."""
-    return [Camera(one, rates[one.name], looks[one.name], looks[READINGS]) for one in detectors]
 
 
 def filter_in_conditions(
@@ -84,11 +68,13 @@ def filter_in_conditions(
     publishes. `found` is true if a moving object in view was detected, whereas `seen` is true for any
     detection.
     """
+    assert source.detections is not None  # They are the reference of a sweep
     rms = level_rms(source)
     with one_blas_thread():
         levels = sorted({state.sound_level for state in conditions})
         heard = {level: _heard(source, level, rms, seed) for level in levels}
-        reference = _reference(source, [one.stamp_ns for one in next(iter(heard.values()))])
+        stamps_ns = [one.stamp_ns for one in next(iter(heard.values()))]
+        reference = _moving_boxes(source.detections, stamps_ns, DetectionFilter())
         return {
             one.detector.name: joined(
                 _filtered(source, one, heard[state.sound_level], reference, state) for state in conditions
@@ -141,13 +127,6 @@ def _filtered(
     )
 
 
-def _reference(source: Source, stamps_ns: Sequence[int]) -> list[FloatArray]:
-    """Return the moving reference boxes at each stamp."""
-    if source.detections is None:
-        return [np.empty((0, 4))] * len(stamps_ns)
-    return _moving_boxes(source.detections, stamps_ns, DetectionFilter())
-
-
 def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFilter) -> list[FloatArray]:
     """Return the accepted moving boxes, shape (boxes, 4), of the frame at each stamp."""
     longest_ns, found = nanoseconds(MAX_IMAGE_AGE_S), []
@@ -162,12 +141,8 @@ def _moving_boxes(log: DetectionLog, stamps_ns: Sequence[int], keep: DetectionFi
 
 def _found(reference: Sequence[FloatArray], query: VisionQuery, stamps_ns: Sequence[int]) -> BoolArray:
     """Return whether a moving reference box was detected at each stamp, counted as for a miss rate."""
-    detected = _moving_boxes(query.detections, stamps_ns, query.keep) if query.detections else []
-    found = [
-        (overlaps(there, boxes) >= MIN_OVERLAP).any()
-        for there, boxes in zip(reference, detected, strict=True)
-    ]
-    return np.array(found, dtype=bool)
+    pairs = zip(reference, _moving_boxes(query.detections, stamps_ns, query.keep), strict=True)
+    return np.array([(overlaps(there, boxes) >= MIN_OVERLAP).any() for there, boxes in pairs], dtype=bool)
 
 
 def _presence(source: Source, measurements: Sequence[Measurement]) -> list[float]:

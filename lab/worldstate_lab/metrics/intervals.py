@@ -161,6 +161,21 @@ def draw_weights(draws: IndexArray, recordings: int) -> FloatArray:
     return np.array([np.bincount(one, minlength=recordings) for one in draws], np.float64)
 
 
+def pooled_share(hits: AnyArray, counts: AnyArray, draws: IndexArray) -> tuple[float, FloatArray]:
+    """Return the hits over the counts of all recordings, and in every draw; NaN without counts.
+
+    Shapes: hits, counts (n,), draws (D, n).
+
+    Examples
+    --------
+    >>> pooled_share(np.array([1.0, 4.0]), np.array([2.0, 4.0]), draws=np.array([[0, 0], [0, 1]]))
+    (0.8333333333333334, array([0.5       , 0.83333333]))
+    """
+    every = np.concatenate([np.arange(len(counts))[None], draws])
+    shares = ratio(hits[every].sum(axis=1), counts[every].sum(axis=1))
+    return float(shares[0]), shares[1:]
+
+
 def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
     """Return the quotient, NaN if the denominator is zero.
 

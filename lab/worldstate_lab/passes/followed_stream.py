@@ -28,9 +28,7 @@ from worldstate.commissioning.sequence_training import StreamTruth, stream_truth
 from worldstate.core.filter import WorldFilter
 from worldstate.ground import LEAST_HEARD
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.measurement.measurement import (
-    Measurement,
-)
+from worldstate.measurement.measurement import Measurement
 from worldstate.operations.metrics.approach_table import AFTER_S
 from worldstate.simulation.camera.simulated_detector import BOX_NOISE_PX, inside, miss_rate, project
 from worldstate.simulation.scene.junction import Site

@@ -17,8 +17,7 @@ to the hops with a second vehicle at that time, so that every group has the base
 import math
 from bisect import insort
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 from scipy.signal import lfilter, sosfilt
@@ -40,7 +39,6 @@ from worldstate.ground.values import wrap_angle
 from worldstate.operations.metrics.approach_table import (
     HORIZON_S,
     SLACK_S,
-    ApproachOutcome,
     ApproachTable,
     Figures,
     StreamApproach,
@@ -48,7 +46,7 @@ from worldstate.operations.metrics.approach_table import (
     mean_of,
     shortly_before,
 )
-from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
+from worldstate.operations.recordings.hop_table import HOP_S, HopTable
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 from worldstate.simulation.stream.rendering import SILENCE_PA2, band_filter
@@ -71,11 +69,6 @@ def sound_level_db(pressure_pa: AnyArray, sample_rate_hz: float, hops: int) -> F
     sound = sosfilt(band_filter(sample_rate_hz), pressure_pa)
     power = np.square(sound).reshape(hops, -1).mean(axis=1)
     return np.asarray(10.0 * np.log10(_half_second(power) / REFERENCE_PA**2 + 1e-9))
-
-
-def above_place_db(heard: HeardStream) -> FloatArray:
-    """Return the level above its 20 % quantile of the stream so far, shape (n,)."""
-    return above_quiet_db(level_db(heard))
 
 
 def above_quiet_db(level: FloatArray) -> FloatArray:
@@ -105,31 +98,6 @@ def _half_second(power: AnyArray) -> FloatArray:
 
 EXISTS, NEAR_RAD, SEEN_AFTER_S = 0.5, np.radians(10.0), 1.0
 HIDDEN_S, KEPT_S, KEPT_RAD = 3.0, 3.0, np.radians(20.0)
-
-
-@dataclass(frozen=True, slots=True)
-class PassOutcome:
-    """Advisories and entities of one approach."""
-
-    alarm: ApproachOutcome
-    hidden_before: int  # Number of different hidden entities before T0
-    identity: bool | None  # None if there was no hidden or no visible entity
-
-
-def outcomes(stream: PassedStream) -> list[PassOutcome]:
-    """Return the outcome of every approach that is completely within the stream."""
-    followed = stream.followed
-    found = []
-    for alarm in alarm_outcomes(stream.heard, followed.time_s, followed.advisory):
-        last = max(alarm.approach.entries_s)
-        hidden = {
-            entity.id
-            for hop in np.flatnonzero(shortly_before(followed.time_s, last))
-            for side in (0, 1)
-            for entity in followed.hidden(int(hop), side, EXISTS)
-        }
-        found.append(PassOutcome(alarm, len(hidden), _identity(stream, alarm.approach)))
-    return found
 
 
 def _identity(stream: PassedStream, one: StreamApproach) -> bool | None:
@@ -190,12 +158,20 @@ def pass_figures(streams: Sequence[PassedStream]) -> Figures:
 
 def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
     """Return the numbers of advisories and entities of loud approaches, and the share of kept identities."""
-    loud = [one for stream in streams for one in outcomes(stream) if not one.alarm.approach.quiet]
-    judged = [one.identity for one in loud if one.identity is not None]
-    both = [one.hidden_before for one in loud if one.alarm.approach.flow == "both"]
+    kept, third = list[bool | None](), list[bool]()
+    for stream in streams:
+        followed = stream.followed
+        for one in alarm_outcomes(stream.heard, followed.time_s, followed.advisory):
+            if not one.approach.quiet:
+                kept.append(_identity(stream, one.approach))
+            if one.approach.flow == "both" and not one.approach.quiet:
+                before = shortly_before(followed.time_s, max(one.approach.entries_s))
+                sides = product(np.flatnonzero(before).tolist(), (0, 1))
+                third.append(len({e.id for at in sides for e in followed.hidden(*at, EXISTS)}) > 2)
+    judged = [one for one in kept if one is not None]
     return {
         "onsets_per_approach": mean_of([one.onsets for one in table.outcomes if one.detected]),
-        "phantom_third": mean_of([hidden > 2 for hidden in both]),
+        "phantom_third": mean_of(third),
         "identity_judged": len(judged),
         "identity_kept": mean_of(judged),
         "onset_after_pass": mean_of([one.onsets_after > 0 for one in table.of_flow("single").outcomes]),
@@ -205,23 +181,23 @@ def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
 def onsets_by_traffic(streams: Sequence[PassedStream]) -> Mapping[str, Figures]:
     """Return the onset rate on hazard-free streams, by traffic."""
     found: dict[str, list[tuple[HeardStream, BoolArray]]] = {}
-    for one in streams:
-        if one.heard.hazard_free:
-            found.setdefault(str(one.heard.hops.about["traffic"]), []).append(
-                (one.heard, one.followed.advisory)
-            )
+    for one in (one for one in streams if one.heard.hazard_free):
+        same = found.setdefault(str(one.heard.hops.about["traffic"]), [])
+        same.append((one.heard, one.followed.advisory))
     return {name: approach_table(some).false_alarms() for name, some in sorted(found.items())}
 
 
 def _meter(streams: Sequence[PassedStream], onsets_per_hour: float | None) -> Figures:
     """Return the detections of a level threshold at the same onset rate."""
-    quiet = [("", above_place_db(one.heard)) for one in streams if one.heard.hazard_free]
+    names = ("detected", "lead_missed_as_0_s", "onsets_per_hour")
     if onsets_per_hour is None:
-        return dict.fromkeys(("meter_detected", "meter_lead_missed_as_0_s", "meter_onsets_per_hour"))
+        return {f"meter_{name}": None for name in names}
+    above = [(one.heard, above_quiet_db(level_db(one.heard))) for one in streams]
+    quiet = [("", db) for heard, db in above if heard.hazard_free]
     least_db = measured_curve(quiet).default(onsets_per_hour).threshold_nats
-    louder = ((one.heard, raised_at(above_place_db(one.heard), least_db)) for one in streams)
-    figures = approach_table([(heard, np.stack([on, on], axis=1)) for heard, on in louder]).loud().figures()
-    return {f"meter_{name}": figures[name] for name in ("detected", "lead_missed_as_0_s", "onsets_per_hour")}
+    louder = [(heard, np.repeat(raised_at(db, least_db)[:, None], 2, axis=1)) for heard, db in above]
+    figures = approach_table(louder).loud().figures()
+    return {f"meter_{name}": figures[name] for name in names}
 
 
 def _ahead(streams: Sequence[PassedStream]) -> Figures:
@@ -348,21 +324,16 @@ GAPS_S = {"below 1.5 s": (0.0, 1.5), "1.5 to 4 s": (1.5, 4.0)}
 COLUMNS = ("behind", "since", "gap_s", "added_db", "chance", "comes", "masked")
 
 
-def second_hops(stream: PassedStream) -> HopTable:
-    """Return hops of both sides after the first T0 until a second vehicle comes; gap NaN if none does."""
-    rows = [row for one, added in _loud(stream) for row in _rows(stream, one, added)]
-    return HopTable.of_rows(COLUMNS, rows)
+def _loud(stream: PassedStream) -> list[StreamApproach]:
+    return [one for one in approaches(stream.heard) if not one.quiet]
 
 
-def _loud(stream: PassedStream) -> Iterator[tuple[StreamApproach, FloatArray]]:
-    """Yield the loud approaches with the level that the last vehicle adds at every hop."""
-    loud = [one for one in approaches(stream.heard) if not one.quiet]
-    numbers, added = (
-        stream.heard.vehicles.vehicle.tolist(),
-        added_db(stream.heard) if loud else np.zeros((0, 0)),
-    )
-    for one in loud:
-        yield one, added[numbers.index(vehicle_at(stream.heard, one.entries_s[-1]))]
+def second_hops(stream: PassedStream) -> Iterator[tuple[float, ...]]:
+    """Yield hops of both sides after the first T0 until a second vehicle comes; gap NaN if none does."""
+    if loud := _loud(stream):
+        added = dict(zip(stream.heard.vehicles.vehicle.tolist(), added_db(stream.heard), strict=True))
+        for one in loud:
+            yield from _rows(stream, one, added[vehicle_at(stream.heard, one.entries_s[-1])])
 
 
 def _rows(stream: PassedStream, one: StreamApproach, added: FloatArray) -> Iterator[tuple[float, ...]]:
@@ -384,7 +355,7 @@ def _rows(stream: PassedStream, one: StreamApproach, added: FloatArray) -> Itera
 
 def second_figures(streams: Sequence[PassedStream]) -> Figures:
     """Return figures of the chances and the entities of second vehicles, by side and gap."""
-    hops = joined(map(second_hops, streams))
+    hops = HopTable.of_rows(COLUMNS, chain.from_iterable(map(second_hops, streams)))
     kept = [row for stream in streams for row in _kept_apart(stream)]
     heard = hops.added_db >= NOTICED_DB
     found: Figures = {}
@@ -392,10 +363,8 @@ def second_figures(streams: Sequence[PassedStream]) -> Figures:
         here = (hops.behind == behind) & (hops.gap_s >= low) & (hops.gap_s < high)
         mine = [row[2:] for row in kept if row[0] == behind and low <= row[1] < high]
         same, merged = ([row[i] for row in mine if row[0]] for i in (1, 2))
-        figures = {
-            **{"approaches": len(mine)} | _noticed(hops, here & heard) | _masked(hops, here & ~heard),
-            **{"stated apart": len(same), "identity kept": mean_of(same), "merged": mean_of(merged)},
-        }
+        figures = {"approaches": len(mine)} | _noticed(hops, here & heard) | _masked(hops, here & ~heard)
+        figures |= {"stated apart": len(same), "identity kept": mean_of(same), "merged": mean_of(merged)}
         found |= {f"{side}, {gap}: {name}": value for name, value in figures.items()}
     return found
 
@@ -435,9 +404,7 @@ def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool,
     The flags are: it existed, it is visible at the vehicle's position, it became that of the first vehicle.
     """
     followed = stream.followed
-    for one, _ in _loud(stream):
-        if len(one.entries_s) < 2:
-            continue
+    for one in (one for one in _loud(stream) if len(one.entries_s) > 1):
         behind = one.sides[0] == one.sides[1]
         before = int(np.searchsorted(followed.time_s, one.entries_s[0] - SLACK_S)) - 1
         # Entities are chosen by their share of that side, because one of unknown side may be the first

@@ -25,7 +25,7 @@ from worldstate_lab.evaluation.ablation_rows import (
     ablation_table,
     evaluate_ablation,
 )
-from worldstate_lab.metrics.intervals import deal_folds, draw_weights, middle, ratio, stratified_draws
+from worldstate_lab.metrics.intervals import deal_folds, middle, pooled_share, stratified_draws
 
 from .hearing import Chain, heard
 from .recordings import CornerRecording
@@ -153,9 +153,8 @@ def _aware_of(
     hits = np.array([aware[one.name][seen].sum() for one, seen in zip(approaches, in_view, strict=True)])
     hops = np.array([seen.sum() for seen in in_view])
     draws = stratified_draws([str(one.about["site"]) for one in approaches], rng)
-    weights = draw_weights(draws, len(approaches))
-    low, high = middle(ratio(weights @ hits, weights @ hops))
-    return {"aware": float(hits.sum() / hops.sum()), "aware_low": low, "aware_high": high}
+    share, drawn = pooled_share(hits, hops, draws)
+    return {"aware": share, "aware_low": middle(drawn)[0], "aware_high": middle(drawn)[1]}
 
 
 def _aware(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float) -> dict[str, BoolArray]:

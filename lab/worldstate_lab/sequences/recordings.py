@@ -17,7 +17,7 @@ from worldstate.adapters.files.file_io import load_npz, number, read_json, read_
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.given_spectra import HALF_HOPS, GivenSpectra
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.typing import BoolArray, Float32Array, FloatArray
+from worldstate.ground.typing import Float32Array, FloatArray, IndexArray
 from worldstate.ground.values import nanoseconds
 
 TRUTH, SPECTRA = "truth.csv", "srp.npz"
@@ -194,7 +194,7 @@ def without_standing(log: DetectionLog) -> DetectionLog:
     images = np.array([len(np.unique(image[one])) for one in there])
     moving = np.split(~(spans & (images >= _STANDS_IMAGES)), np.flatnonzero(np.diff(image)) + 1)
     kept = dict(zip(np.unique(image).tolist(), moving, strict=True))
-    frames = [_only(one, kept[at]) if at in kept else one for at, one in enumerate(log.frames)]
+    frames = [only(one, np.flatnonzero(kept[at])) if at in kept else one for at, one in enumerate(log.frames)]
     return DetectionLog(tuple(frames), log.stamps_ns, log.source)
 
 
@@ -204,6 +204,7 @@ def _from(log: DetectionLog) -> DetectionLog:
     return DetectionLog(log.frames[first:], log.stamps_ns[first:], log.source)
 
 
-def _only(frame: DetectionFrame, kept: BoolArray) -> DetectionFrame:
-    labels = tuple(label for label, keep in zip(frame.labels, kept.tolist(), strict=True) if keep)
+def only(frame: DetectionFrame, kept: IndexArray) -> DetectionFrame:
+    """Return some boxes of an image."""
+    labels = tuple(frame.labels[at] for at in kept.tolist())
     return DetectionFrame(frame.boxes_px[kept], frame.scores[kept], labels)

@@ -7,33 +7,25 @@ left out.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, reduce
+from functools import lru_cache
 from itertools import product
-from operator import add
 from pathlib import Path
 
 import numpy as np
 
 from worldstate.adapters.camera.camera_channel import any_motion
-from worldstate.adapters.camera.camera_health import LEVELS
-from worldstate.adapters.camera.detections import (
-    PARKED_S,
-    DetectionFilter,
-    DetectionFrame,
-    DetectionLog,
-    kept_and_parked,
-)
+from worldstate.adapters.camera.detections import PARKED_S, DetectionFilter, DetectionLog, kept_and_parked
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import nanoseconds
 from worldstate.operations.detectors.miss_rate_measurement import AbsenceSettings, AbsenceTally
-from worldstate_lab.degradation.beta_curves import BetaCurves, beta_curves
+from worldstate_lab.degradation.beta_curves import BetaCurves, beta_curves, pooled, staged_levels
 from worldstate_lab.degradation.conditions import FAMILIES, Condition, at_level
-from worldstate_lab.metrics.intervals import draw_weights, middle, ratio
+from worldstate_lab.metrics.intervals import middle, pooled_share
 from worldstate_lab.report.table import Value
 
-from .recordings import NANODET_BOXES, CornerRecording
+from .recordings import NANODET_BOXES, CornerRecording, only
 from .staged_video import Staging
 
 # Candidates; the detector reports no score below the first.
@@ -171,12 +163,11 @@ def vision_row(
     hits, looks = np.array(
         [two for two, one in zip(counted, recordings, strict=True) if not one.hazard_free], np.float64
     ).T
-    weights = draw_weights(draws, len(looks))
-    aware = Value(_share([(hits.sum(), looks.sum())]), *middle(ratio(weights @ hits, weights @ looks)))
+    share, drawn = pooled_share(hits, looks, draws)
     free = [(one.junction, two) for one, two in zip(recordings, counted, strict=True) if one.hazard_free]
     names = sorted({junction for junction, _ in free})
     shares = {name: _share(two for junction, two in free if junction == name) for name in names}
-    return VisionRow(state.name, int(looks.sum()), aware, shares)
+    return VisionRow(state.name, int(looks.sum()), Value(share, *middle(drawn)), shares)
 
 
 def _looks(staging: Staging, state: Condition, recording: CornerRecording) -> tuple[int, int]:
@@ -213,10 +204,7 @@ def staged_beta(staging: Staging, approaches: Sequence[CornerRecording], draws: 
 
 def staged_miss_rates(staging: Staging, approaches: Sequence[CornerRecording]) -> MissRates:
     """Return the same counts in the library's format: the miss rates of this detector."""
-    counted = [_beta_counts(staging, one) for one in approaches]
-    families: dict[str, FamilyCounts] = {
-        name: reduce(add, (one[name] for one in counted)) for name in FAMILIES
-    }
+    families = pooled([_beta_counts(staging, one) for one in approaches])
     edges_deg = AbsenceSettings(FAMILIES, NANODET_BOXES).edges_deg(PinholeCamera.ovad())
     return MissRates(edges_deg, families, {"detector": staging.detector, "images": "staged real videos"})
 
@@ -224,18 +212,10 @@ def staged_miss_rates(staging: Staging, approaches: Sequence[CornerRecording]) -
 def _beta_counts(staging: Staging, recording: CornerRecording) -> dict[str, FamilyCounts]:
     tally = AbsenceTally(PinholeCamera.ovad(), AbsenceSettings(FAMILIES, NANODET_BOXES))
     clean, _ = _clean_boxes(recording)
-    for family, level in product(FAMILIES, range(len(LEVELS))):
-        # The clean camera belongs to every family but is counted once.
-        if level or family == FAMILIES[0]:
-            staged = _boxes_in(staging.folder(at_level(family, level)), recording)
-            for at, found in zip(_clean_images(recording, staged), staged.frames, strict=True):
-                if at is not None:
-                    tally.count(clean, at, counted(found, kept_boxes(staging.detector)), family, level)
+    keep = kept_boxes(staging.detector)
+    for family, level in staged_levels():
+        staged = _boxes_in(staging.folder(at_level(family, level)), recording)
+        for at, found in zip(_clean_images(recording, staged), staged.frames, strict=True):
+            if at is not None:
+                tally.count(clean, at, only(found, found.select(keep)), family, level)
     return tally.counts()
-
-
-def counted(frame: DetectionFrame, keep: DetectionFilter) -> DetectionFrame:
-    """Return the accepted boxes of an image."""
-    kept = frame.select(keep)
-    labels = tuple(frame.labels[at] for at in kept.tolist())
-    return DetectionFrame(frame.boxes_px[kept], frame.scores[kept], labels)
