@@ -19,9 +19,8 @@ from worldstate_lab.sequences.path_tables import alarm_table
 from worldstate_lab.sequences.recordings import NANODET_BOXES, read_recordings
 from worldstate_lab.sequences.scores import (
     alarm_row,
-    at_false_recordings,
-    at_onsets,
     calibration,
+    curve,
     hop_before,
     leads,
     sweep,
@@ -141,11 +140,11 @@ def test_a_row_of_the_curve_has_one_threshold() -> None:
     scores = [np.where(before(one, 1.0), 0.5, np.where(before(one, 3.0), 0.3, 0.0)) for one in trials]
     scores[0][before(trials[0], 0.3)] = 0.9
     scores[2][10], scores[3][20:30] = 0.6, 0.3
-    found = at_onsets(trials, scores, draw())
+    found = curve(trials, scores, "onsets", draw())
     assert [found[n]["threshold"] for n in ("0", "1", "3", "6")] == [0.9, 0.5, 0.3, 0.3]
     assert [found[n]["count"] for n in ("0", "1", "3")] == [1.0, 2.0, 2.0]
     assert [round(found[n]["lead_s_missed_0"], 2) for n in ("0", "1", "3")] == [0.15, 1.0, 3.0]
-    by_recording = at_false_recordings(trials, scores, draw())
+    by_recording = curve(trials, scores, "false_recordings", draw())
     assert [by_recording[n]["threshold"] for n in ("0", "1", "2", "3")] == [0.9, 0.5, 0.3, 0.3]
 
 

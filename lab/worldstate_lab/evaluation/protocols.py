@@ -127,12 +127,12 @@ def run_protocol(
     protocol: Protocol,
     trials: Sequence[Trial],
     methods: Sequence[Method],
-    classifiers: Classifiers,
+    classifiers: Classifiers | None,
     seeds: Sequence[int],
 ) -> ProtocolRun:
     """Fit and apply all methods on all folds for every seed; by junction, only the first seed is used.
 
-    The trials must have the ego motion of the protocol.
+    The trials must have the ego motion of the protocol. Without classifiers they keep the scores they have.
     """
     # Junctions are not drawn at random: another seed would give the same folds.
     used = tuple(seeds[:1]) if protocol.by_junction else tuple(seeds)
@@ -141,7 +141,7 @@ def run_protocol(
         said: dict[str, dict[int, Decisions]] = {method.name: {} for method in methods}
         for calibration, tested in protocol.parts(trials, np.random.default_rng(seed)):
             parts = [trials[i] for i in calibration], [trials[i] for i in tested]
-            before, after = classifiers.classify(protocol.trained_on, *parts, seed)
+            before, after = classifiers.classify(protocol.trained_on, *parts, seed) if classifiers else parts
             for method in methods:
                 decide = method.fit(before, np.random.default_rng(seed))
                 said[method.name] |= {i: decide(trial) for i, trial in zip(tested, after, strict=True)}
@@ -151,7 +151,7 @@ def run_protocol(
         name: tuple(tuple(one[name][i] for i in rows) for one in passes)
         for name in (method.name for method in methods)
     }
-    trained_on = classifiers.trained_on(protocol.trained_on)
+    trained_on = classifiers.trained_on(protocol.trained_on) if classifiers else ""
     return ProtocolRun(protocol, tuple(trials[i] for i in rows), decisions, used, trained_on)
 
 

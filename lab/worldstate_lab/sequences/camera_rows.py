@@ -48,8 +48,10 @@ def corner_rows(
 ) -> dict[str, dict[str, Figures]]:
     """Return the ablation rows of the paper's statistic and of the shipped system with one camera."""
     last_s = last_seen_s(recordings, chain)
-    chains = variants(chain, measured, degradation)
-    made = {name: corner_streams(one, recordings, last_s, jobs) for name, one in chains.items()}
+    made = {
+        name: list(in_processes(partial(_stream, one, last_s), recordings, jobs))
+        for name, one in variants(chain, measured, degradation).items()
+    }
     prior = list(chain.model.signature.reference_prior)
     by_statistic = statistic_rows(made["product"], prior, seed, switches)
     return {
@@ -71,21 +73,11 @@ def variants(chain: Chain, measured: MissRates | None, degradation: float) -> di
     return found
 
 
-def corner_streams(
-    chain: Chain, recordings: Sequence[CornerRecording], last_seen_s: Mapping[str, float], jobs: int = 1
-) -> list[HopTable]:
-    """Process recordings; the column `there` marks hops until the vehicle leaves the view (clean boxes)."""
-    heard_hops = in_processes(partial(_stream, chain), recordings, jobs)
-    return [_with_truth(one, last_seen_s[one.name]) for one in heard_hops]
-
-
-def _stream(chain: Chain, recording: CornerRecording) -> HopTable:
+def _stream(chain: Chain, last_s: Mapping[str, float], recording: CornerRecording) -> HopTable:
+    """Process a recording; the column `there` marks hops until the vehicle leaves the view (clean boxes)."""
     hops = heard(chain, recording).hops
-    return hops.replace(log_likelihoods=hops.shipped)
-
-
-def _with_truth(hops: HopTable, last_s: float) -> HopTable:
-    return hops.replace(there=(hops.time_s > hops.t0_s) & (hops.time_s <= last_s))
+    there = (hops.time_s > hops.t0_s) & (hops.time_s <= last_s[recording.name])
+    return hops.replace(log_likelihoods=hops.shipped, there=there)
 
 
 def last_seen_s(recordings: Sequence[CornerRecording], chain: Chain) -> dict[str, float]:

@@ -15,6 +15,7 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_inputs import COLUMNS, SIDES
 from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.adapters.camera.detections import DetectionLog
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.array_file import read_array
@@ -28,13 +29,13 @@ from worldstate.state import RiskCue, WorldState
 from worldstate_lab.trials.listening import (
     box_table,
     filtered_decisions,
-    frame_row,
-    reference_rad,
+    hop_columns,
     tables_of_steps,
     unfiltered_decisions,
     widest_moving,
+    with_scores,
 )
-from worldstate_lab.trials.pass_cache import ALPHA, SCORES
+from worldstate_lab.trials.pass_cache import ALPHA
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
 from .recordings import NANODET_BOXES, CornerRecording
@@ -81,6 +82,8 @@ class Chain:
         d of the camera, if known.
     settings : ListenSettings
         Settings of the listener.
+    image_step : int
+        2 withholds every second image of the camera.
     """
 
     path: PathName
@@ -90,6 +93,7 @@ class Chain:
     miss_rates: MissRates | None = None
     degradation: float = 0.0
     settings: ListenSettings = _SETTINGS
+    image_step: int = 1
 
     def source(self, recording: CornerRecording) -> Source:
         """Return the recording with its model and its camera."""
@@ -102,7 +106,10 @@ class Chain:
             model=self.model,
             settings=self.settings,
         )
-        return replace(source, degradation=self.degradation)
+        log, step = source.detections, self.image_step
+        if log is not None:
+            log = DetectionLog(log.frames[::step], log.stamps_ns[::step], log.source)
+        return replace(source, degradation=self.degradation, detections=log)
 
     def steps(self, recording: CornerRecording) -> Iterator[Step]:
         """Yield every hop of a recording."""
@@ -138,32 +145,22 @@ def heard(chain: Chain, recording: CornerRecording) -> Trial:
     vision = source.camera_channel()
     boxes = box_table(source, vision)
     said = tables_of_steps(recording.name, steps)
-    stream = said["stream"]
-    rows = [frame_row(one.frame) for one in steps]
-    hops = HopTable.of_rows(("features", "prominence", "log_slope_hz", "bearing_rad"), rows)
-    product = HopTable.of_rows(PRODUCT_COLUMNS, map(_product_row, steps))
-    reference = np.array([reference_rad(one.frame, vision) for one in steps])
-    measured = ("time_s", "answer", "miss_rate", "clutter_rate", "approach", "seen")
-    table = HopTable(
-        {**{name: stream.columns[name] for name in measured}, **hops.columns, **product.columns},
-        recording.name,
-        recording.side,
-        np.nan if recording.hazard_free else recording.t0_s,
-        {"site": recording.junction, "moving": False, "camera": chain.boxes is not None},
-    ).replace(
-        reference_rad=reference,
-        srp_rad=np.where(np.isfinite(reference), hops.bearing_rad, np.nan),
-        bearing_std_rad=np.array([one.frame.bearing_std_rad for one in steps]),
-        shipped=stream.log_likelihoods,
-        grounded=stream.grounded,
-        rateless=stream.rateless,
+    product = HopTable.of_rows(PRODUCT_COLUMNS, map(_product_row, steps)).columns
+    frames = [one.frame for one in steps]
+    about = {"site": recording.junction, "moving": False, "camera": chain.boxes is not None}
+    t0_s = np.nan if recording.hazard_free else recording.t0_s
+    hops = HopTable(
+        {
+            **hop_columns(said["stream"], frames, vision),
+            **product,
+            "bearing_std_rad": np.array([frame.bearing_std_rad for frame in frames]),
+        },
+        *(recording.name, recording.side, t0_s, about),
     )
-    prior = list(chain.model.signature.reference_prior)
-    about = {**table.about, "prior": dict.fromkeys(SCORES, prior)}
     truth = HopTable.of_rows(TRUTH_COLUMNS, [] if recording.hazard_free else widest_moving(boxes))
     policy = chain.model.policies.for_alpha(ALPHA)
     chains = {"shipped": unfiltered_decisions(said, policy), "filtered": filtered_decisions(said)}
-    return Trial(table.replace(about=about), boxes, truth, chains)
+    return Trial(with_scores(hops, said["stream"], chain.model), boxes, truth, chains)
 
 
 def _product_row(step: Step) -> tuple[FloatArray, ...]:

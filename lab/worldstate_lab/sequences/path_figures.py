@@ -1,7 +1,7 @@
 """Every figure of one path over the recordings of street corners, with the camera and with sound alone."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SMOOTHED_HOPS, SequencePosterior
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequencePosterior
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.file_io import read_json
 from worldstate.frontend.settings import HOP_RATE_HZ
@@ -27,7 +27,7 @@ from worldstate_lab.trials.trial import Decide, Decisions, Method, Trial
 
 from .hearing import Chain, heard
 from .recordings import NANODET_BOXES, CornerRecording
-from .scores import Row, alarm_row, at_false_recordings, at_onsets, calibration, leads, with_interval
+from .scores import LIMITS, Row, alarm_row, calibration, curve, leads, log_odds, smoothed, with_intervals
 from .tracking import Tracked, tracked
 
 SEEDS = 5  # The same number as in `table --full`
@@ -108,18 +108,6 @@ def classifiers_of(features: Path, lists: Sequence[Path]) -> Classifiers:
     return Classifiers(read_features(features).without(frozenset().union(*map(read_ids, lists))))
 
 
-@dataclass(slots=True)
-class _Untrained(Classifiers):
-    """No published classifier: trials are returned unchanged."""
-
-    windows: None = field(default=None)
-
-    def classify(
-        self, kind: Any, calibration: Any, tested: Any, seed: int
-    ) -> tuple[list[Trial], list[Trial]]:
-        return list(calibration), list(tested)
-
-
 BySide = Callable[[Trial], FloatArray]
 
 
@@ -160,14 +148,12 @@ def score_figures(
     """Return the lead times of a score, shape (n,) per trial, and the curves over its thresholds."""
     return {
         "leads": leads(trials, scores, right, rng),
-        "at_onsets": at_onsets(trials, scores, rng),
-        "at_false_recordings": at_false_recordings(trials, scores, rng),
+        **{f"at_{limited}": curve(trials, scores, limited, rng) for limited in LIMITS},
     }
 
 
 _MEAN_HOPS = 20  # Two seconds
 _LEAST_NATS = -20.0  # Value if the window gives no sides
-_SMALLEST = 1e-9  # Lower bound of a probability before its log-odds are computed
 
 
 def _window(trial: Trial) -> FloatArray:
@@ -200,10 +186,7 @@ def _decision(trial: Trial) -> FloatArray:
     # `compared_nats`, which the alarm compares with its threshold, has another scale in the first second of
     # every recording, before the sequence model has input. In the curves those hops would count as early
     # warnings.
-    chance = np.clip(np.nan_to_num(trial.hops.within[..., HORIZONS_S.index(3.0)]), _SMALLEST, 1.0 - _SMALLEST)
-    log_odds = np.log(chance) - np.log1p(-chance)
-    recent = np.arange(len(log_odds))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
-    return np.asarray(log_odds[np.maximum(recent, 0)].mean(axis=1))
+    return smoothed(log_odds(np.nan_to_num(trial.hops.within[..., HORIZONS_S.index(3.0)])))
 
 
 _risk, _compared = attrgetter("hops.risk"), attrgetter("hops.compared_nats")
@@ -232,7 +215,7 @@ def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dic
     """Return every figure of a path; without classifiers, rows of the published classifier are missing."""
     rng = np.random.default_rng(seed)
     methods = (*_OWN, *_SIGHT, *(_TABLE if classifiers else ()))
-    run = run_protocol(STATIC, path.seen, methods, classifiers or _Untrained(), range(seed, seed + SEEDS))
+    run = run_protocol(STATIC, path.seen, methods, classifiers, range(seed, seed + SEEDS))
     scores = {one.name: one.figures(path, rng) for one in SCORES}
     return {
         "recordings": len(path.seen),
@@ -265,13 +248,8 @@ def _window_figures(run: ProtocolRun, method: str, rng: np.random.Generator) -> 
     score = Score.of(run.trials, run.decisions[method])
     draws = stratified_draws(score.strata, rng)
     drawn = score.draws(np.vstack([np.arange(len(run.trials)), draws]))
-    horizons = {name: with_interval(name, drawn[f"auroc_{name}"]) for name in WINDOWS_S}
-    risk = {name: with_interval(name, drawn[name]) for name in ("ece_raw", "ece")}
-    return {"horizons": _merged(horizons), "risk": _merged(risk)}
-
-
-def _merged(rows: Mapping[str, Row]) -> Row:
-    return {key: value for row in rows.values() for key, value in row.items()}
+    horizons = with_intervals({name: drawn[f"auroc_{name}"] for name in WINDOWS_S})
+    return {"horizons": horizons, "risk": with_intervals({name: drawn[name] for name in ("ece_raw", "ece")})}
 
 
 # By name in a path's figures: the name of the same figure in the simulated exam of a model.

@@ -15,7 +15,7 @@ import numpy as np
 
 from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
 from worldstate.abduction.sequence.sequence_inputs import SIDES
-from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SMOOTHED_HOPS
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import (
     AFTER_S,
@@ -35,7 +35,9 @@ from worldstate_lab.trials.trial import Trial
 LEADS_S = (0.5, 1.0, 1.5, 2.0, 3.0)
 # This long before T0 the vehicle is inaudible: a score above chance comes from the ambience of its recording.
 CONTROLS_S = (5.0, 6.0)
-ONSETS, FALSE_RECORDINGS = (0, 1, 3, 6), (0, 1, 2, 3)
+# Limits of a curve: onsets, and hazard-free recordings in alarm.
+LIMITS = {"onsets": (0, 1, 3, 6), "false_recordings": (0, 1, 2, 3)}
+_LEAST_CHANCE = 1e-9  # Lower bound of a probability before its log-odds are computed
 LASTS_S = 0.5  # Time before T0 at which a lasting alarm is on
 PASSED_S = 2.0  # Time after T0; later advisories concern a vehicle that has passed
 WITHIN_S = 2.0  # Horizon of the calibrated chance
@@ -112,20 +114,23 @@ def _lead(
     ]
     there = np.array([hop.size for hop in hops])
     by_site = {site: areas(chosen, ~free, weights * (sites == site)) for site in np.unique(sites).tolist()}
-    found = with_interval("auroc", areas(chosen, ~free, weights))
-    found |= with_interval("auroc_all_hops", areas(every, ~free, weights))
+    whole = {"auroc": areas(chosen, ~free, weights), "auroc_all_hops": areas(every, ~free, weights)}
+    found = with_intervals(whole)
     found["auroc_by_junction"] = {site: float(values[0]) for site, values in by_site.items()}
     found["auroc_by_junction_interval"] = {site: middle(values[1:]) for site, values in by_site.items()}
     if sides is not None:
         parts = [sides[i][hops[i]] for i in np.flatnonzero(~free).tolist()]
         right = np.array([one.label == "right" for one in trials])[~free]
-        found |= with_interval("side_auroc", areas(parts, right, weights[:, ~free]))
+        found |= with_intervals({"side_auroc": areas(parts, right, weights[:, ~free])})
     return found | {"approaches": int(there[~free].sum()), "hazard_free": int(there[free].sum())}
 
 
-def with_interval(name: str, values: FloatArray) -> Row:
-    """Return the first value with the central interval of the draws after it."""
-    return {name: float(values[0]), f"{name}_interval": middle(values[1:])}
+def with_intervals(figures: Mapping[str, FloatArray]) -> Row:
+    """Return the first value of every figure with the central interval of the draws after it."""
+    found: Row = {}
+    for name, values in figures.items():
+        found |= {name: float(values[0]), f"{name}_interval": middle(values[1:])}
+    return found
 
 
 def first_lead_s(trial: Trial, alarm: BoolArray) -> float:
@@ -209,33 +214,16 @@ def _false_alarms(tables: Sequence[ApproachTable]) -> Row:
     }
 
 
-def at_onsets(
-    trials: Sequence[Trial], scores: Sequence[FloatArray], rng: np.random.Generator
+def curve(
+    trials: Sequence[Trial], scores: Sequence[FloatArray], limited: str, rng: np.random.Generator
 ) -> dict[str, Row]:
-    """Return a curve: for each number of onsets, the row of the best threshold with at most that many.
+    """Return, for each limit of one of `LIMITS`, the row of the best threshold with at most that many.
 
     The best threshold has the most warned recordings and, among equals, the longest mean lead.
     """
-    return _curve(trials, scores, "onsets", ONSETS, rng)
-
-
-def at_false_recordings(
-    trials: Sequence[Trial], scores: Sequence[FloatArray], rng: np.random.Generator
-) -> dict[str, Row]:
-    """Return the same rows with at most this many hazard-free recordings in alarm."""
-    return _curve(trials, scores, "false_recordings", FALSE_RECORDINGS, rng)
-
-
-def _curve(
-    trials: Sequence[Trial],
-    scores: Sequence[FloatArray],
-    limited: str,
-    most: Sequence[int],
-    rng: np.random.Generator,
-) -> dict[str, Row]:
     swept, rows = sweep(trials, scores), {}
     order = np.lexsort((swept["level"], swept["lead_s"], swept["warned"]))
-    for n in most:
+    for n in LIMITS[limited]:
         level = float(swept["level"][order[swept[limited][order] <= n][-1]])
         alarms = [score >= level for score in scores]
         rows[f"{n}"] = alarm_row(trials, [alarms], rng) | {"threshold": level}
@@ -276,6 +264,18 @@ def calibration(trials: Sequence[Trial], rng: np.random.Generator, *, within_s: 
     }
     spread = {f"{name}_interval": middle(np.array([one[name] for one in drawn], float)) for name in drawn[0]}
     return found | spread
+
+
+def log_odds(chance: FloatArray) -> FloatArray:
+    """Return the log-odds of probabilities of any shape; those near zero and one are bounded."""
+    bounded = np.clip(chance, _LEAST_CHANCE, 1.0 - _LEAST_CHANCE)
+    return np.asarray(np.log(bounded) - np.log1p(-bounded))
+
+
+def smoothed(values: FloatArray) -> FloatArray:
+    """Return the mean of the last three hops, same shape."""
+    recent = np.arange(len(values))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
+    return np.asarray(values[np.maximum(recent, 0)].mean(axis=1))
 
 
 def _calibrated(pairs: AnyArray) -> dict[str, float | None]:

@@ -67,9 +67,8 @@ class WatchedImages:
 
     def seen(self, min_score: float, min_height_px: float) -> int:
         """Return the number of images with an accepted box."""
-        return sum(
-            bool(((one[:, 0] >= min_score) & (one[:, 1] > min_height_px)).any()) for one in self.images
-        )
+        scored = ((one[:, 0] >= min_score, one[:, 1] > min_height_px) for one in self.images)
+        return sum(bool((likely & high).any()) for likely, high in scored)
 
 
 def watched_images(recording: CornerRecording) -> WatchedImages:
@@ -113,14 +112,12 @@ def box_choices(watched: Sequence[WatchedImages]) -> tuple[BoxChoice, ...]:
 
 
 def _choice(watched: Sequence[WatchedImages], min_score: float, min_height_px: float) -> BoxChoice:
-    found, false = (
-        _share(one for one in ((w.seen(min_score, min_height_px), len(w.images)) for w in group))
-        for group in ([w for w in watched if w.hazard_free is free] for free in (False, True))
-    )
+    counts = [(one.hazard_free, one.seen(min_score, min_height_px), len(one.images)) for one in watched]
+    found, false = (_share(two for free, *two in counts if free is kind) for kind in (False, True))
     return BoxChoice(min_score, min_height_px, found, false)
 
 
-def _share(counts: Iterable[tuple[int, int]]) -> float:
+def _share(counts: Iterable[Sequence[int]]) -> float:
     hits, images = np.array([(0, 0), *counts]).sum(axis=0).tolist()
     return hits / images if images else float("nan")
 

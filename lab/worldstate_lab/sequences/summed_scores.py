@@ -14,12 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import COLUMNS, INPUTS, SIDES, sequence_inputs
-from worldstate.abduction.sequence.sequence_model import (
-    HORIZONS_S,
-    SMOOTHED_HOPS,
-    SequenceModel,
-    SequencePosterior,
-)
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequenceModel, SequencePosterior
 from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.commission import parts_of, stream_evidence, stream_weights
 from worldstate.commissioning.guard_training import fit_softmax
@@ -29,6 +24,8 @@ from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_table import HOP_S
 from worldstate_lab.trials.trial import Trial
 
+from .scores import log_odds, smoothed
+
 # Inputs that are not window evidence: level, loudness, bands, prominence, approach and bearing.
 OTHERS = tuple(name for name in INPUTS if not re.search("this|other|lean|visible", name))
 _OTHER_INPUTS = [INPUTS.index(name) for name in OTHERS]
@@ -37,7 +34,6 @@ _LEVELS = [i for i, name in enumerate(COLUMNS) if name == "loudness" or name.sta
 COMING_S = 3.0
 # Between 0.0002 and 2 the AUROC of the sum one second before T0 changes by 0.01.
 STRENGTH = 0.02
-_LEAST = 1e-9  # Lower bound of a probability before its log-odds are computed
 
 Scores = dict[str, list[FloatArray]]
 
@@ -99,7 +95,7 @@ def _parts(
     # A window that the guard rejected is evidence for no side.
     ratio = np.nan_to_num(seven.hops.side_nats).max(axis=1)
     published = seven.hops.compared_nats.max(axis=1)
-    smoothed = {
+    terms = {
         "sequence, levels of one channel": one,
         "sequence, levels of both channels": both,
         "side ratio": ratio,
@@ -114,8 +110,8 @@ def _parts(
         "sequence, levels of one channel, one hop": one,
         "sequence, levels of both channels, one hop": both,
         "sequence, as published": published,
-        **{name: _smoothed(values) for name, values in smoothed.items()},
-        "sequence, as published + side ratio + logistic": published + _smoothed(ratio + levels),
+        **{name: smoothed(values) for name, values in terms.items()},
+        "sequence, as published + side ratio + logistic": published + smoothed(ratio + levels),
     }
 
 
@@ -126,13 +122,12 @@ def _others(columns: FloatArray) -> FloatArray:
 
 def _coming(columns: FloatArray, sequence: SequenceModel) -> FloatArray:
     """Return the log-odds of coming into view within 3 s from the sequence alone, shape (n, 2)."""
-    usual = SequencePosterior(sequence.share[None, None], 0.0)
-    return _known(columns, lambda known: _log_odds(sequence.posterior(known)), float(_log_odds(usual)[0, 0]))
 
+    def read(posterior: SequencePosterior) -> FloatArray:
+        return log_odds(posterior.within()[..., HORIZONS_S.index(COMING_S)])
 
-def _log_odds(posterior: SequencePosterior) -> FloatArray:
-    within = np.clip(posterior.within()[..., HORIZONS_S.index(COMING_S)], _LEAST, 1.0 - _LEAST)
-    return np.asarray(np.log(within) - np.log1p(-within))
+    usual = read(SequencePosterior(sequence.share[None, None], 0.0))
+    return _known(columns, lambda known: read(sequence.posterior(known)), float(usual[0, 0]))
 
 
 def _known(columns: FloatArray, read: Callable[[FloatArray], FloatArray], usual: float) -> FloatArray:
@@ -155,9 +150,3 @@ def _window_nats(trial: Trial) -> FloatArray:
     """Return the log-odds of a hidden vehicle against none from the window, shape (n,)."""
     left, right, _, none = (trial.hops.shipped + np.log(trial.hops.about["prior"]["shipped"])).T
     return np.asarray(np.logaddexp(left, right) - none)
-
-
-def _smoothed(values: FloatArray) -> FloatArray:
-    """Return the mean of the last three hops, shape (n,)."""
-    recent = np.arange(len(values))[:, None] + np.arange(1 - SMOOTHED_HOPS, 1)
-    return np.asarray(values[np.maximum(recent, 0)].mean(axis=1))

@@ -27,7 +27,7 @@ from worldstate_lab.trials.trial import Trial
 
 from .hearing import Chain, chances, cue_of
 from .recordings import CornerRecording
-from .scores import Row, alarm_row, at_onsets, calibration, leads
+from .scores import Row, alarm_row, calibration, curve, leads
 
 LEADS, CAMERAS = ("0.5", "1", "2"), {"with the camera": True, "sound alone": False}
 
@@ -59,10 +59,10 @@ class WindowFilter:
             cues = [cue_of(world.state, side) for side in SIDES]
             said = [(one.risk, chances(one), one.advisory is not None) for one in cues]
             rows.append((measurement.stamp_ns * 1e-9, *map(np.array, zip(*said, strict=True))))
-        table = HopTable.of_rows(("time_s", "risk", "within", "advised"), rows)
+        hops = HopTable.of_rows(("time_s", "risk", "within", "advised"), rows)
         about = {"site": recording.junction, "leads_from_s": recording.t0_s}
         t0_s = np.nan if recording.hazard_free else recording.t0_s
-        return Trial(HopTable(table.columns, recording.name, recording.side, t0_s, about))
+        return Trial(hops.replace(name=recording.name, label=recording.side, t0_s=t0_s, about=about))
 
 
 FILTERS = (
@@ -105,7 +105,7 @@ def _row(trials: Sequence[Trial], rng: np.random.Generator) -> Row:
     before = leads(trials, scores, right, rng)
     return {
         "leads": {lead: before[lead] for lead in LEADS},
-        "at_onset": at_onsets(trials, scores, rng)["1"],
+        "at_onset": curve(trials, scores, "onsets", rng)["1"],
         "alarms": alarm_row(trials, [alarms], rng),
         "within_1s": calibration(trials, rng, within_s=1.0),
     }
@@ -113,17 +113,8 @@ def _row(trials: Sequence[Trial], rng: np.random.Generator) -> Row:
 
 def window_lines(path: str, found: dict[str, Any]) -> list[str]:
     """Return the rows as one table per camera setting."""
-    heads = (
-        "filter",
-        "0.5 s",
-        "1 s",
-        "2 s",
-        "side 1 s",
-        "side 2 s",
-        "skill 1 s",
-        "advisories",
-        "onsets <= 1",
-    )
+    areas = (*(f"{one} s" for one in LEADS), *(f"side {one} s" for one in LEADS[1:]))
+    heads = ("filter", *areas, "skill 1 s", "advisories", "onsets <= 1")
     lines = list[str]()
     for camera, rows in found.items():
         cells = [(name, *_cells(row)) for name, row in rows.items()]

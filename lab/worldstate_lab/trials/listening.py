@@ -1,6 +1,6 @@
 """Passes over the sound of one recording: values of the front-end, and decisions of the whole chain."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import GroundedSettings
 from worldstate.adapters.acoustic import Grounding, observe
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
-from worldstate.adapters.camera.detections import kept_and_parked
+from worldstate.adapters.camera.detections import DetectionLog, kept_and_parked
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.datasets.ovad import read_true_tracks
 from worldstate.adapters.files.acoustic_domain import feature_order
@@ -31,7 +31,7 @@ from worldstate.frontend.settings import BEARING_HOPS, HOP_RATE_HZ, FrontEndSett
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.errors import OutOfDomainError
-from worldstate.ground.typing import BoolArray, FloatArray
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream
 from worldstate.state import RiskCue, WorldState
@@ -52,10 +52,7 @@ from .trial import (
 # Increased whenever a pass over the same recording would give different numbers.
 VERSION = 6
 # Two settings of the library: with the initial reference of the site, and with a reference that is learned.
-CHAINS = {
-    "plain": ListenSettings(site_adaptation=False),
-    "adapted": ListenSettings(),
-}
+CHAINS = {"plain": ListenSettings(site_adaptation=False), "adapted": ListenSettings()}
 # The grounded likelihood without its approach rate, for an ablation.
 RATELESS = Grounding(settings=GroundedSettings(without=frozenset({"radial_speed_m_s", "inverse_tta_hz"})))
 SIDES = {"left": LEFT, "right": RIGHT}
@@ -89,21 +86,11 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     boxes = box_table(source, vision)
     truth = _truth(take, boxes)
     pairs = list(measure_steps(replace(source, model=_Silent())))
-    frames = [frame_row(frame) for frame, _ in pairs]
-    stream = hop_stream((m for _, m in pairs), name=take.name)
-    reference = np.array([reference_rad(frame, vision) for frame, _ in pairs])
-    seen = np.isfinite(reference)
+    frames = [frame for frame, _ in pairs]
+    columns = hop_columns(hop_stream((m for _, m in pairs), name=take.name), frames, vision)
     with open_audio(source.audio_path, strict=False) as audio:
-        music = _music(audio, source.array, [frame for frame, _ in pairs], seen)
+        columns["music_rad"] = _music(audio, source.array, frames, np.isfinite(columns["reference_rad"]))
         doppler = "no vehicle" if take.t0_s is None else _doppler(audio, source.array, take.t0_s)
-    measured = ("time_s", "answer", "miss_rate", "clutter_rate", "approach", "seen")
-    columns = {
-        **{name: stream.columns[name] for name in measured},
-        **HopTable.of_rows(("features", "prominence", "log_slope_hz", "bearing_rad"), frames).columns,
-        "reference_rad": reference,
-        "music_rad": music,
-    }
-    columns["srp_rad"] = np.where(seen, columns["bearing_rad"], np.nan)
     about = {
         "site": take.site,
         "moving": take.moving,
@@ -114,6 +101,26 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     t0_s = np.nan if take.t0_s is None else take.t0_s
     hops = HopTable(columns, take.name, take.label, t0_s, about)
     return {"hops": hops, "boxes": boxes, "truth": truth}
+
+
+def hop_columns(
+    stream: HopTable, frames: Sequence[AcousticFrame], vision: VisionQuery
+) -> dict[str, AnyArray]:
+    """Return the columns of a trial that need no model, from a hop stream, its frames and moving boxes."""
+    measured = ("time_s", "answer", "miss_rate", "clutter_rate", "approach", "seen")
+    named = ("features", "prominence", "log_slope_hz", "bearing_rad")
+    heard = HopTable.of_rows(named, map(frame_row, frames)).columns
+    reference = np.array([reference_rad(frame, vision) for frame in frames])
+    srp = np.where(np.isfinite(reference), heard["bearing_rad"], np.nan)
+    measures = {name: stream.columns[name] for name in measured}
+    return {**measures, **heard, "reference_rad": reference, "srp_rad": srp}
+
+
+def with_scores(hops: HopTable, stream: HopTable, model: Model) -> HopTable:
+    """Return the hops of a trial with the scores of a model, and its prior for each of them."""
+    scores = {"shipped": stream.log_likelihoods, "grounded": stream.grounded, "rateless": stream.rateless}
+    prior = {key: list(model.signature.reference_prior) for key in scores}
+    return hops.replace(**scores, about={**hops.about, "prior": prior})
 
 
 def model_refusal(take: Take, model: Model) -> str | None:
@@ -242,10 +249,9 @@ def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
 
 def box_table(source: Source, vision: VisionQuery) -> HopTable:
     """Return the boxes of a camera with the columns of a trial."""
-    log = source.detections
+    log = source.detections or DetectionLog((), np.empty(0, np.int64))
     rows: list[tuple[Any, ...]] = []
-    for number, frame in enumerate(() if log is None else log.frames):
-        assert log is not None
+    for number, frame in enumerate(log.frames):
         kept, still = kept_and_parked(log, number, vision.keep)
         moving = set(kept[~still].tolist())
         for i, box in enumerate(frame.boxes_px):

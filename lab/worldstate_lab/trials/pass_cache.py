@@ -29,6 +29,7 @@ from .listening import (
     front_end_tables,
     model_refusal,
     unfiltered_decisions,
+    with_scores,
 )
 from .trial import Take, Trial
 
@@ -134,7 +135,9 @@ class PassCache:
         # Both files must exist: a run may have been killed after it wrote the first.
         if path.is_file() and sealed.is_file():
             try:
-                _check_seal(path, sealed)
+                if sealed.read_bytes() != _seal(path).encode():
+                    # The tables may be readable but not those written under this name.
+                    raise InputFileError(path, f"expected the content recorded in {sealed.name}")
                 return load_named(path, "tables of a pass")
             except InputFileError as error:
                 warnings.warn(f"{error}; computed again", stacklevel=2)
@@ -148,12 +151,6 @@ class PassCache:
 
 def _seal(path: Path) -> str:
     return f"{path.stem} {content_hash(path)}\n"
-
-
-def _check_seal(path: Path, sealed: Path) -> None:
-    """Raise an error if tables are not those written under this name, even if they are readable."""
-    if sealed.read_bytes() != _seal(path).encode():
-        raise InputFileError(path, f"expected the content recorded in {sealed.name}")
 
 
 Item = TypeVar("Item")
@@ -237,27 +234,14 @@ class Hearer:
             "adapted": unfiltered_decisions(said["adapted"], policy),
             "filtered": filtered_decisions(said["adapted"]),
         }
-        stream = said["plain"]["stream"]
-        prior = list(model.signature.reference_prior)
-        hops = hops.replace(
-            shipped=stream.log_likelihoods,
-            grounded=stream.grounded,
-            rateless=stream.rateless,
-            about={**hops.about, "prior": dict.fromkeys(SCORES, prior)},
-        )
+        hops = with_scores(hops, said["plain"]["stream"], model)
         return Trial(hops, heard["boxes"], heard["truth"], chains)
 
 
 def hear(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
     """Return the trials in the order of the recordings, and the failed recordings."""
-    trials: list[Trial] = []
-    failed: list[Failed] = []
-    for found in heard:
-        if isinstance(found, Failed):
-            failed.append(found)
-        else:
-            trials.append(found)
-    return trials, failed
+    every = list(heard)
+    return [one for one in every if isinstance(one, Trial)], [one for one in every if isinstance(one, Failed)]
 
 
 def data_fingerprint(trials: Sequence[Trial]) -> str:

@@ -245,12 +245,7 @@ class TakeList:
         return f"{kind}, folder {self.root.name}{split}"
 
 
-def find_takes(
-    root: Path,
-    *,
-    static_ids: Path | None = None,
-    dynamic_ids: Path | None = None,
-) -> TakeList:
+def find_takes(root: Path, *, static_ids: Path | None = None, dynamic_ids: Path | None = None) -> TakeList:
     """Find the recordings of a data set in OVAD's layout; raise an error if any data are missing.
 
     Test recordings are those in the given lists, otherwise those in the official lists if the folder contains
