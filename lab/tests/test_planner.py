@@ -63,7 +63,7 @@ def stream(name: str = "SB2", entries_s: tuple[float, ...] = ENTRIES_S, known: b
     columns = dict(zip(names, np.array(rows).reshape(-1, 6).T, strict=True))
     columns["in_view"] = columns["in_view"].astype(bool)
     heard = HeardStream(table, HopTable(told), HopTable(columns))
-    return with_chances(heard, HopTable({"time_s": time_s, "within": chances}))
+    return with_chances(heard, time_s, chances)
 
 
 EVERY = (stream(), stream("SA1"), stream(entries_s=()))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import expm
 
 from worldstate.ground.checks import in_range
 from worldstate.ground.typing import FloatArray
@@ -28,6 +29,8 @@ ARRIVALS_HZ, DEPARTURES_HZ = 0.1, 0.01
 # The sound comes from an axle, but the position is that of the vehicle's centre, half a wheelbase (1.35 m)
 # away at most.
 EXTENT_STD_M = 1.0
+_REACH_M = np.arange(-3.0 * EXTENT_STD_M, 3.0 * EXTENT_STD_M + 0.5 * STEP_M, STEP_M)
+_EXTENT = np.exp(-0.5 * (_REACH_M / EXTENT_STD_M) ** 2)
 STATED_STD_M = 5.0
 
 
@@ -144,7 +147,7 @@ class PlaceFilter:
         """Return the estimate for the centre of the vehicle."""
         along = self.model.along_m
         heard = belief.of_places
-        shares = np.convolve(heard, _extent(), mode="same")
+        shares = np.convolve(heard, _EXTENT, mode="same")
         shares = shares / shares.sum()
         mean = float(shares @ along)
         std = float(np.sqrt(shares @ (along - mean) ** 2))
@@ -157,8 +160,6 @@ class PlaceFilter:
 @lru_cache(maxsize=4)
 def _transitions(dt_s: float) -> tuple[FloatArray, FloatArray]:
     """Return the transitions of speeds, (V, V), and of positions by velocity, (V, N, N), rows to columns."""
-    from scipy.linalg import expm
-
     number, places = len(VELOCITIES_MPS), round(2.0 * FARTHEST_M / STEP_M) + 1
     rate = 0.5 * (SPEED_NOISE / (SPEEDS_MPS[1] - SPEEDS_MPS[0])) ** 2
     generator = rate * (np.eye(number, k=1) + np.eye(number, k=-1))
@@ -180,11 +181,6 @@ def _moved(steps: float, places: int) -> FloatArray:
     ahead, back = 0.5 * (spread + rest**2 + rest), 0.5 * (spread + rest**2 - rest)
     eye = [np.eye(places, k=whole + k) for k in (-1, 0, 1)]
     return np.asarray(back * eye[0] + (1.0 - ahead - back) * eye[1] + ahead * eye[2])
-
-
-def _extent() -> FloatArray:
-    reach = np.arange(-3.0 * EXTENT_STD_M, 3.0 * EXTENT_STD_M + 0.5 * STEP_M, STEP_M)
-    return np.asarray(np.exp(-0.5 * (reach / EXTENT_STD_M) ** 2))
 
 
 LANE_STD_M = 1.0  # A vehicle may use either lane of the crossing street

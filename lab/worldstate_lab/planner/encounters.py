@@ -11,9 +11,8 @@ from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
 from worldstate.commissioning.stream_exam import approaches
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import StreamApproach
-from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate_lab.passes.followed_stream import passed_stream
@@ -52,7 +51,7 @@ class BelievedStream:
     """The chances in a stream's snapshots, and its vehicles; the two sides are left and right."""
 
     time_s: FloatArray  # shape (n,)
-    within: FloatArray  # shape (n, 2, horizons): Probability to come into view within each horizon
+    within: Float32Array  # shape (n, 2, horizons): Probability to come into view within each horizon
     heard: HeardStream
     site: Site
     ways: tuple[Crossing, ...]  # Vehicles from a hidden arm
@@ -61,16 +60,15 @@ class BelievedStream:
 
 def believed_stream(path: Path, model: Model) -> BelievedStream:
     """Return a stream with its chances."""
-    followed = passed_stream(path, model).followed
-    chances = HopTable({"time_s": followed.time_s, "within": followed.within.astype(np.float32)})
-    return with_chances(HeardStream.load(path), chances)
+    passed = passed_stream(path, model)
+    return with_chances(passed.heard, passed.followed.time_s, passed.followed.within.astype(np.float32))
 
 
-def with_chances(heard: HeardStream, chances: HopTable) -> BelievedStream:
+def with_chances(heard: HeardStream, time_s: FloatArray, within: Float32Array) -> BelievedStream:
     """Return a stream with published chances; a missing chance is set to one."""
     return BelievedStream(
-        time_s=chances.time_s,
-        within=np.nan_to_num(chances.within, nan=1.0),
+        time_s=time_s,
+        within=np.nan_to_num(within, nan=1.0),
         heard=heard,
         site=junction_named(heard.site),
         ways=tuple(_way(heard, i) for i in np.flatnonzero(heard.vehicles.hazard).tolist()),
@@ -167,7 +165,7 @@ class Encounters:
     corner_m: FloatArray  # shape (n, 2): Distance of the corners from the ego's axis
     # shape (n, 2): Distance ahead of the lanes of vehicles from the left and from the right
     lane_m: FloatArray
-    within: FloatArray  # shape (n, STEPS / HOP_STEPS, 2, horizons)
+    within: Float32Array  # shape (n, STEPS / HOP_STEPS, 2, horizons)
     # shape (n, STEPS, K): Distance of the front to the ego's axis, negative after crossing
     to_come_m: FloatArray
     # shape (n, STEPS, K): Whether it is in view from the position at which the state was recorded
@@ -183,6 +181,12 @@ class Encounters:
     def line_m(self) -> FloatArray:
         """Distance ahead of the start of the nearer lane, shape (n,)."""
         return np.asarray(self.lane_m[:, 0] - HALF_LANE_M)
+
+    @property
+    def paths_m(self) -> tuple[FloatArray, FloatArray]:
+        """Distances ahead of the start and the end of every vehicle's path, shape (n, K) each."""
+        lane, half = np.take_along_axis(self.lane_m, self.side, axis=1), 0.5 * self.width_m
+        return lane - half, lane + half
 
 
 def joined_encounters(parts: Sequence[Encounters]) -> Encounters:

@@ -123,16 +123,11 @@ def unseen_from_m(before_m: FloatArray, sight_m: FloatArray, driven_m: float) ->
 
 
 def _for_assumed(
-    encounters: Encounters,
-    ego: EgoVehicle,
-    x: FloatArray,
-    v: FloatArray,
-    reach_m: FloatArray,
-    assumed: BoolArray,
+    met: Encounters, ego: EgoVehicle, x: FloatArray, v: FloatArray, reach_m: FloatArray, assumed: BoolArray
 ) -> FloatArray:
     """Return the acceleration with which the ego can still stop before an assumed vehicle."""
-    room = encounters.line_m - ego.gap_m - x
-    out_m = encounters.lane_m + HALF_LANE_M + ego.length_m - x[:, None]
+    room = met.line_m - ego.gap_m - x
+    out_m = met.lane_m + HALF_LANE_M + ego.length_m - x[:, None]
     arrives_s = (reach_m - 0.5 * ego.width_m) / ego.limit_mps - ego.reaction_s
     passes = ego.soonest_s(out_m, v[:, None]) + ego.gap_s <= arrives_s
     # Beyond the line it is too late to stop for an assumed vehicle.
@@ -157,12 +152,12 @@ def _for_seen(
     now, before = (encounters.to_come_m[:, one] for one in steps)
     speed = np.maximum((before - now) / (2.0 * STEP_S), _LEAST_MPS)
     now = now - speed * late * STEP_S
-    half, lane = 0.5 * encounters.width_m, np.take_along_axis(encounters.lane_m, encounters.side, axis=1)
+    starts_m, ends_m = encounters.paths_m
     # A vehicle that braked before the corner accelerates after it: its present speed must not be
     # extrapolated.
     enters_s = ego.soonest_s(now - 0.5 * ego.width_m, speed)
     leaves_s = (now + 0.5 * ego.width_m + encounters.length_m) / speed
-    in_m, out_m = lane - half - x[:, None], lane + half + ego.length_m - x[:, None]
+    in_m, out_m = starts_m - x[:, None], ends_m + ego.length_m - x[:, None]
     first = ego.soonest_s(out_m, v[:, None]) + ego.gap_s <= enters_s
     after = leaves_s + ego.gap_s <= ego.soonest_s(in_m, v[:, None])
     lets_pass = known & ~first & ~after & (leaves_s > 0.0) & (out_m > 0.0)
@@ -177,8 +172,8 @@ def _for_seen(
 
 def _overlaps(encounters: Encounters, ego: EgoVehicle, x: FloatArray, step: int) -> BoolArray:
     """Return whether the footprint of the ego overlaps that of a vehicle."""
-    lane, half = np.take_along_axis(encounters.lane_m, encounters.side, axis=1), 0.5 * encounters.width_m
-    along = (x[:, None] > lane - half) & (x[:, None] - ego.length_m < lane + half)
+    starts_m, ends_m = encounters.paths_m
+    along = (x[:, None] > starts_m) & (x[:, None] - ego.length_m < ends_m)
     front = encounters.to_come_m[:, step]
     across = (front < 0.5 * ego.width_m) & (front + encounters.length_m > -0.5 * ego.width_m)
     return np.asarray((along & across).any(axis=1))
@@ -186,10 +181,10 @@ def _overlaps(encounters: Encounters, ego: EgoVehicle, x: FloatArray, step: int)
 
 def _needed(encounters: Encounters, ego: EgoVehicle) -> BoolArray:
     """Return whether an ego that never brakes comes so close in time to a vehicle that braking is needed."""
-    lane, half = np.take_along_axis(encounters.lane_m, encounters.side, axis=1), 0.5 * encounters.width_m
+    starts_m, ends_m = encounters.paths_m
     begins, speed = (encounters.line_m - ego.begins_m)[:, None], np.array([ego.begins_mps])
-    in_s = ego.soonest_s(lane - half - begins, speed) - NEEDED_WITHIN_S
-    out_s = ego.soonest_s(lane + half + ego.length_m - begins, speed) + NEEDED_WITHIN_S
+    in_s = ego.soonest_s(starts_m - begins, speed) - NEEDED_WITHIN_S
+    out_s = ego.soonest_s(ends_m + ego.length_m - begins, speed) + NEEDED_WITHIN_S
     clock_s = (np.arange(STEPS) * STEP_S)[:, None]
     there = (clock_s >= in_s[:, None]) & (clock_s <= out_s[:, None])
     front, length = encounters.to_come_m, encounters.length_m[:, None]
@@ -198,14 +193,8 @@ def _needed(encounters: Encounters, ego: EgoVehicle) -> BoolArray:
 
 
 Of = TypeVar("Of")
-UNAWARE, PHANTOM, FULL, MEMORY, CHANCE, LOUD = (
-    "no knowledge",
-    "phantom",
-    "phantom, full brakes",
-    "memory",
-    "chance",
-    "chance, loud",
-)
+UNAWARE, PHANTOM, FULL = "no knowledge", "phantom", "phantom, full brakes"
+MEMORY, CHANCE, LOUD = "memory", "chance", "chance, loud"
 THRESHOLDS = tuple(round(0.001 * 2.0 ** (0.5 * step), 4) for step in range(13))
 # Shares of corners with a vehicle.
 SHARES = (0.05, 0.2)
@@ -303,10 +292,8 @@ def _figures(
     corners: Corners, drives: CornerDrives, needless_s: FloatArray, phantom_s: FloatArray
 ) -> dict[str, float | int]:
     told: dict[str, float | int] = {}
-    for name, replays, driven in (
-        ("loud", corners.loud, drives.loud),
-        ("quiet", corners.quiet, drives.quiet),
-    ):
+    pairs = (corners.loud, drives.loud), (corners.quiet, drives.quiet)
+    for name, (replays, driven) in zip(("loud", "quiet"), pairs, strict=True):
         hit = driven.collided
         low, high = share_interval(int(hit.sum()), hit.size)
         told |= {f"{name}_collisions": int(hit.sum()), f"{name}_replays": hit.size}

@@ -10,11 +10,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from worldstate.frontend.hop_spectra import LevelMeter
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray, TextArray
@@ -137,19 +135,15 @@ def band_profile(windows: Iterable[tuple[Float32Array, float]], vehicle: BoolArr
         if not np.array_equal(meter.edges_hz, edges_hz):
             raise InvalidArgumentError(f"windows: expected a single sample rate, got {rate_hz:g} Hz too")
         rows.append(meter.push(samples))
-    if edges_hz is None:
+    if edges_hz is None or min(vehicle.sum(), (~vehicle).sum()) < 2:
         raise InvalidArgumentError("windows: expected at least two with a vehicle and two without")
-    return profile_of(np.array(rows), vehicle, edges_hz)
-
-
-def profile_of(energy: FloatArray, vehicle: BoolArray, edges_hz: FloatArray) -> BandProfile:
-    """Compare log-energies (n, B) with and without a vehicle."""
+    energy = np.array(rows)
     shape = level_invariant_shape(energy)
     by_level, by_shape = (fisher_profile(one[vehicle], one[~vehicle]) for one in (energy, shape))
     return BandProfile(edges_hz, by_level, by_shape, discriminative_range_hz(by_shape, edges_hz))
 
 
-def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
+def level_invariant_shape(band_log_energy: FloatArray) -> FloatArray:
     r"""Remove the level from log band energies: the result does not change with gain or range.
 
     .. math:: s_b = \ln E_b - \frac1B \sum_{b'} \ln E_{b'}
@@ -159,13 +153,10 @@ def level_invariant_shape(band_log_energy: ArrayLike) -> FloatArray:
     J. Aitchison, "The statistical analysis of compositional data", J. Roy. Statist. Soc. B 44, 1982 (centred
     log-ratio).
     """
-    energy = finite_array("band_log_energy", band_log_energy, (None,) * np.ndim(band_log_energy))
-    if energy.ndim == 0 or energy.shape[-1] < 2:
-        raise InvalidArgumentError(f"band_log_energy: expected at least 2 bands, got shape {energy.shape}")
-    return np.asarray(energy - energy.mean(axis=-1, keepdims=True))
+    return np.asarray(band_log_energy - band_log_energy.mean(axis=-1, keepdims=True))
 
 
-def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
+def fisher_profile(vehicle: FloatArray, background: FloatArray) -> FloatArray:
     r"""Return the Fisher ratio of every band between two classes.
 
     .. math:: F_b = \frac{(\mu_{1b} - \mu_{0b})^2}{\sigma_{1b}^2 + \sigma_{0b}^2}
@@ -181,45 +172,30 @@ def fisher_profile(vehicle: ArrayLike, background: ArrayLike) -> FloatArray:
         >= 0, with unbiased variances; 0 if both classes are the same constant, infinite if they are
         different constants.
 
-    Raises
-    ------
-    InvalidArgumentError
-        If a shape is wrong, there are too few rows, or a value is not finite.
-
     Notes
     -----
     Sampling adds a bias: without any difference the mean ratio is about 1/(2n) + 1/(2m).
 
     Examples
     --------
-    >>> fisher_profile([[3.0, 0.0], [5.0, 2.0]], [[0.0, 0.0], [2.0, 2.0]])
+    >>> fisher_profile(np.array([[3.0, 0.0], [5.0, 2.0]]), np.array([[0.0, 0.0], [2.0, 2.0]]))
     array([2.25, 0.  ])
     """
-    one = finite_array("vehicle", vehicle, (None, None))
-    zero = finite_array("background", background, (None, one.shape[1]))
-    if min(len(one), len(zero)) < 2:
-        raise InvalidArgumentError(f"expected at least 2 rows of each class, got {len(one)} and {len(zero)}")
-    distance = (one.mean(axis=0) - zero.mean(axis=0)) ** 2
-    spread = one.var(axis=0, ddof=1) + zero.var(axis=0, ddof=1)
+    distance = (vehicle.mean(axis=0) - background.mean(axis=0)) ** 2
+    spread = vehicle.var(axis=0, ddof=1) + background.var(axis=0, ddof=1)
     constant = np.where(distance > 0, np.inf, 0.0)
     return np.asarray(np.divide(distance, spread, out=constant, where=spread > 0))
 
 
-def discriminative_range_hz(
-    profile: ArrayLike, edges_hz: ArrayLike, share: float = 0.5
-) -> tuple[float, float]:
-    r"""Return the contiguous range of bands around the best one whose ratio is at least a share of its ratio.
+def discriminative_range_hz(profile: FloatArray, edges_hz: FloatArray) -> tuple[float, float]:
+    r"""Return the contiguous range of bands around the best one whose ratio is at least half of its ratio.
 
-    .. math:: F_b \ge s\, \max_{b'} F_{b'} \quad \text{for all bands } b \text{ of the range}
+    .. math:: F_b \ge \tfrac12 \max_{b'} F_{b'} \quad \text{for all bands } b \text{ of the range}
 
     Shapes: profile (B,), edges_hz (B + 1,).
     """
-    ratio = finite_array("profile", profile, (None,))
-    edges = finite_array("edges_hz", edges_hz, (len(ratio) + 1,))
-    if len(ratio) == 0 or np.any(np.diff(edges) <= 0) or not 0 < share <= 1:
-        raise InvalidArgumentError("expected at least one band, ascending edges and a share in (0, 1]")
-    best = int(np.argmax(ratio))
-    below = np.flatnonzero(ratio < share * ratio[best])
+    best = int(np.argmax(profile))
+    below = np.flatnonzero(profile < 0.5 * profile[best])
     low = int(below[below < best].max(initial=-1)) + 1
-    high = int(below[below > best].min(initial=len(ratio)))
-    return float(edges[low]), float(edges[high])
+    high = int(below[below > best].min(initial=len(profile)))
+    return float(edges_hz[low]), float(edges_hz[high])

@@ -13,8 +13,8 @@ from worldstate_lab.metrics.intervals import FOLDS, Interval, auroc_by_group, mi
 from .clip_signatures import (
     ClipSignatures,
     discriminative_range_hz,
+    fisher_profile,
     level_invariant_shape,
-    profile_of,
     signature_edges_hz,
 )
 
@@ -65,9 +65,7 @@ def transferred(train: ClipSignatures, test: ClipSignatures, by: By) -> FloatArr
     return np.asarray(machine.decision_function(_features(test.energy, by)))
 
 
-def held_out(
-    table: ClipSignatures, by: By, rng: np.random.Generator
-) -> tuple[ClipSignatures, FloatArray, str]:
+def held_out(table: ClipSignatures, by: By, rng: np.random.Generator) -> "Scored":
     """Return the scored clips, their scores, and the name of the split."""
     train, test = table.select(table.splits == "train"), table.select(table.splits == "test")
     if enough(train) and enough(test):
@@ -202,19 +200,7 @@ def signature_study(
     """
     given: dict[Corpus, ClipSignatures | None] = {IDMT: roadside, MELAUDIS: city}
     tables = {name: one for name, one in given.items() if one is not None}
-    rows, ranges = _rows(tables, rng, on_row)
-    left_out = tuple(problem for one in tables.values() for problem in one.left_out)
-    worst_first = sorted(rows, key=lambda row: (row.value is None, row.value))
-    return SignatureStudy((*worst_first, *ranges), left_out)
-
-
-def _rows(
-    tables: Mapping[Corpus, ClipSignatures],
-    rng: np.random.Generator,
-    on_row: Callable[[], None] = lambda: None,
-) -> tuple[list[SignatureRow], list[SignatureRow]]:
-    """Return the rows on separability, and those of the Fisher profile."""
-    rows, scored = [], dict[tuple[str, ...], _Scored | None]()
+    rows, scored = [], dict[tuple[str, ...], Scored | None]()
     for question in QUESTIONS:
         # Vehicles and quiet road users of a corpus are scored with the same model.
         key = question.by, question.train, question.test, question.microphone
@@ -222,8 +208,14 @@ def _rows(
             scored[key] = _scored(question, tables, rng)
         rows.append(_row(question, tables, scored[key], rng))
         on_row()
-    studio = _studio(tables.get(IDMT))
-    return rows, [row for by in BYS for row in _range_rows(studio, by, rng)]
+    if roadside is not None:
+        # The profile compares motor vehicles and background of the studio microphones.
+        compared = roadside.motor | roadside.background
+        roadside = roadside.select((roadside.microphones == "studio") & compared)
+    ranges = [row for by in BYS for row in _range_rows(roadside, by, rng)]
+    left_out = tuple(problem for one in tables.values() for problem in one.left_out)
+    worst_first = sorted(rows, key=lambda row: (row.value is None, row.value))
+    return SignatureStudy((*worst_first, *ranges), left_out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,19 +251,14 @@ QUESTIONS = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scored:
-    """Clips, their scores, and how the test clips were separated from the training."""
-
-    table: ClipSignatures
-    score: FloatArray
-    split: str
+# Clips, their scores, and how the test clips were separated from the training.
+Scored = tuple[ClipSignatures, FloatArray, str]
 
 
 def _row(
     question: _Question,
     tables: Mapping[Corpus, ClipSignatures],
-    scored: _Scored | None,
+    scored: Scored | None,
     rng: np.random.Generator,
 ) -> SignatureRow:
     """Return the row of a question; without a value if a corpus is missing or too small."""
@@ -283,21 +270,21 @@ def _row(
         return replace(row, note=NOWHERE if question.kind == ELECTRIC else command(*names))
     if scored is None:
         return replace(row, note=TOO_FEW)
-    table, measure = scored.table, FIGURES[row.figure]
+    (table, score, split), measure = scored, FIGURES[row.figure]
     positive = table.motor if question.kind == VEHICLE else table.kinds == question.kind
-    scores = scores_of(table, scored.score, positive)
+    scores = scores_of(table, score, positive)
     value = measure(scores)
     if np.isnan(value):
         return replace(row, note=f"no clip of {question.kind}")
     low, high = interval(measure, scores, rng)
     worst = scores.worst_site if measure is area else None
-    note = scored.split + (f"; worst site {worst[0]} {worst[1]:.3f}" if worst else "")
+    note = split + (f"; worst site {worst[0]} {worst[1]:.3f}" if worst else "")
     return replace(row, value=value, low=low, high=high, n_clips=len(scores.score), note=note)
 
 
 def _scored(
     question: _Question, tables: Mapping[Corpus, ClipSignatures], rng: np.random.Generator
-) -> _Scored | None:
+) -> Scored | None:
     """Return the scores of a question's clips, None if a corpus is missing or too small."""
     train, test = tables.get(question.train), tables.get(question.test)
     if train is None or test is None:
@@ -307,8 +294,8 @@ def _scored(
     if not enough(train):
         return None
     if question.microphone:
-        return _Scored(*held_out(train, question.by, rng))
-    return _Scored(test, transferred(train, test, question.by), f"trained on all of {train.name}")
+        return held_out(train, question.by, rng)
+    return test, transferred(train, test, question.by), f"trained on all of {train.name}"
 
 
 def _range_rows(table: ClipSignatures | None, by: By, rng: np.random.Generator) -> list[SignatureRow]:
@@ -331,15 +318,9 @@ def _range_rows(table: ClipSignatures | None, by: By, rng: np.random.Generator) 
 
 
 def _half_range_hz(table: ClipSignatures, by: By) -> tuple[float, float]:
-    profile = profile_of(table.energy, table.motor, signature_edges_hz())
-    return discriminative_range_hz(profile.by_level if by == "level" else profile.by_shape, profile.edges_hz)
-
-
-def _studio(table: ClipSignatures | None) -> ClipSignatures | None:
-    """Return motor vehicles and background of the studio microphones."""
-    if table is None:
-        return None
-    return table.select((table.microphones == "studio") & (table.motor | table.background))
+    energy = _features(table.energy, by)
+    profile = fisher_profile(energy[table.motor], energy[~table.motor])
+    return discriminative_range_hz(profile, signature_edges_hz())
 
 
 def command(*corpora: Corpus) -> str:

@@ -18,7 +18,7 @@ from worldstate.abduction.signature.ensemble_training import standardisation
 from worldstate.abduction.signature.window_classes import hazard_statistic
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.adapters.files.model_file import read_model
-from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc
 from worldstate.operations.training.training import folds_by_recording
 from worldstate_lab.features.published_classifier import PublishedClassifier
@@ -39,18 +39,10 @@ from .simulated_windows import (
 def two_sample_area(one: FeatureTable, other: FeatureTable, rng: np.random.Generator) -> float:
     """Return the area of a boosted classifier on descriptors and log features that separates two sets."""
     # By recording: the hidden and the front window of one vehicle are similar.
-    folds = [folds_by_recording(table, rng) for table in (one, other)]
+    fold = np.concatenate([folds_by_recording(table, rng) for table in (one, other)])
     inputs = np.concatenate([_inputs(table.features) for table in (one, other)])
-    return boosted_area(inputs, np.repeat([0, 1], [len(one), len(other)]), np.concatenate(folds), rng)
-
-
-def boosted_area(inputs: FloatArray, origin: IndexArray, fold: AnyArray, rng: np.random.Generator) -> float:
-    """Return the out-of-fold area of a boosted classifier that separates rows of origin 0 and 1.
-
-    Shapes: inputs (n, m), origin, fold (n,).
-    """
+    origin, score = np.repeat([0, 1], [len(one), len(other)]), np.empty(len(inputs))
     seed = int(rng.integers(2**31))
-    score = np.empty(len(origin))
     with threadpool_limits(1):  # a few hundred rows: threads cost more than they save
         for held_out in np.unique(fold):
             test = fold == held_out
