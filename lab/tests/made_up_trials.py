@@ -1,13 +1,7 @@
 """Recordings and decisions with known figures: 0.1-s hops from the first second on."""
 
 import numpy as np
-from worldstate_lab.trials.trial import (
-    BOX_COLUMNS,
-    TRACK_COLUMNS,
-    TRUTH_COLUMNS,
-    Decisions,
-    Trial,
-)
+from worldstate_lab.trials.trial import BOX_COLUMNS, TRACK_COLUMNS, TRUTH_COLUMNS, Decisions, Trial
 
 from worldstate.operations.recordings.hop_table import HopTable
 

@@ -31,10 +31,7 @@ from worldstate_lab.degradation.conditions import (
 )
 from worldstate_lab.degradation.degradation_study import DegradationSettings, degradation_study
 from worldstate_lab.degradation.staged_filter import Camera, by_condition, filter_in_conditions
-from worldstate_lab.evaluation.report.degradation_section import (
-    degradation_record,
-    sweep_tables,
-)
+from worldstate_lab.evaluation.report.degradation_section import degradation_record, sweep_tables
 from worldstate_lab.trials.pass_cache import Failed, PassCache, attempted
 
 from worldstate.abduction.co_evidence import Absent

@@ -17,14 +17,7 @@ from worldstate_lab.methods.line_of_sight import OcSortRecovery
 from worldstate_lab.sequences.path_figures import exam_figures
 from worldstate_lab.sequences.path_tables import alarm_table
 from worldstate_lab.sequences.recordings import NANODET_BOXES, read_recordings
-from worldstate_lab.sequences.scores import (
-    alarm_row,
-    calibration,
-    curve,
-    hop_before,
-    leads,
-    sweep,
-)
+from worldstate_lab.sequences.scores import alarm_row, calibration, curve, hop_before, leads, sweep
 from worldstate_lab.sequences.window_rows import FILTERS
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S

@@ -141,8 +141,7 @@ CLIPS_A_FILE = 20
 # Minutes of 60 to 62 occur, so the time is not parsed.
 _WHERE = r"(?P<date>\d{4}-\d{2}-\d{2})_\d+-\d+-[\d.]+-(?P<place>[A-Za-z]+)(?P<spot>\d*[A-Za-z]?)"
 _MELAUDIS_NAME = re.compile(
-    _WHERE + r"_(?P<state>[A-Z]+)_(?P<what>NoV|\dV-\w+?)(?:_\w+)?_(?:mono|stereo)",
-    re.ASCII,
+    _WHERE + r"_(?P<state>[A-Z]+)_(?P<what>NoV|\dV-\w+?)(?:_\w+)?_(?:mono|stereo)", re.ASCII
 )
 # A single stray file is harmless. Many indicate a release with other names, of which only a part would be
 # used without notice.
