@@ -154,35 +154,32 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         kinds: Mapping[str, float] | None = None,
     ) -> None:
         domain: ModelDomain | None = getattr(model, "domain", None)
-        if front_end_settings is None:
+        settings, asked = front_end_settings, dict[str, Any]()
+        if settings is None:
             # A model without a domain receives the sound at its recorded rate.
             own = FrontEndSettings(nfft=feature_nfft(sample_rate_hz))
-            front_end_settings = own if domain is None else FrontEndSettings.heard_at(sample_rate_hz)
+            settings = own if domain is None else FrontEndSettings.heard_at(sample_rate_hz)
         if domain is not None and not uncalibrated:
-            order = feature_order(domain, array, sample_rate_hz, front_end_settings)
-            front_end_settings = replaced(front_end_settings, feature_order=order)
+            asked["feature_order"] = feature_order(domain, array, sample_rate_hz, settings)
         if model is None:  # A bearing is wanted as soon as a sound begins, so rises in level are kept
-            front_end_settings = replaced(front_end_settings, mask_rises=False)
+            asked["mask_rises"] = False
         if guard is not None and guard.measures != MEASURES:
             raise OutOfDomainError(f"guard: expected one of {len(MEASURES)} measures of this version")
         if road_users is not None and road_users.measures != (*MEASURES, *BANDS):
             expected = f"one of {len(MEASURES) + len(BANDS)} measures of this version"
             raise OutOfDomainError(f"road users: expected {expected}, got {len(road_users.measures)} others")
         if guard is not None or road_users is not None:
-            front_end_settings = replaced(front_end_settings, character=True)
+            asked["character"] = True
         if isinstance(sequence, SequenceReader):
-            front_end_settings = replaced(front_end_settings, level_band_hz=LEVEL_BAND_HZ)
+            asked["level_band_hz"] = LEVEL_BAND_HZ
+        settings = replaced(settings, **asked)
         self.source = "acoustic"
         self.front_end: FrontEnd | SpectrumFrontEnd
-        self.front_end = FrontEnd(array, sample_rate_hz, front_end_settings, start_ns=start_ns)
+        self.front_end = FrontEnd(array, sample_rate_hz, settings, start_ns=start_ns)
         self.last_frame: AcousticFrame | None = None
-        self._model = model
-        self._vision = vision
-        self._grounding = grounding
-        self._guard = guard
-        self._road_users = road_users
-        self._sequence = sequence
-        self._kinds = kinds
+        self._model, self._vision, self._grounding = model, vision, grounding
+        self._guard, self._road_users = guard, road_users
+        self._sequence, self._kinds = sequence, kinds
         self._directions: tuple[str, ...] = SIDES
 
     def measure(self, block: Float32Array, /) -> list[Measurement]:
@@ -273,23 +270,20 @@ def read_hop(
     reader: SequenceReader, signature: SignatureEvidence, frame: AcousticFrame
 ) -> SequenceReading | NotUsable:
     """Return the result of a sequence after one more hop of evidence and front-end measures."""
-    sides = signature.sides
+    sides, looming = signature.sides, frame.looming
     if sides is None:
         return NotUsable("the model has no evidence per side")
-    looming = frame.looming
-    rate_hz = std_hz = np.nan
-    if not isinstance(looming, NotUsable):
-        rate_hz, std_hz = looming.inverse_tta_hz, looming.std_hz
-    columns = hop_columns(
-        np.array([sides.log_ratios]),
-        np.array([sides.visible]),
-        feature=frame.feature[None],
-        band_log_energy=frame.band_log_energy[None],
-        prominence=np.array([frame.prominence]),
-        looming_hz=np.array([rate_hz]),
-        looming_std_hz=np.array([std_hz]),
-        bearing_rad=np.array([frame.bearing_rad]),
-    )
+    known = None if isinstance(looming, NotUsable) else looming
+    hop = {
+        "feature": frame.feature,
+        "band_log_energy": frame.band_log_energy,
+        "prominence": frame.prominence,
+        "looming_hz": np.nan if known is None else known.inverse_tta_hz,
+        "looming_std_hz": np.nan if known is None else known.std_hz,
+        "bearing_rad": frame.bearing_rad,
+    }
+    rows = {name: np.array([value]) for name, value in hop.items()}
+    columns = hop_columns(np.array([sides.log_ratios]), np.array([sides.visible]), **rows)
     return reader.read(columns, frame.feature)
 
 

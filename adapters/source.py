@@ -467,15 +467,12 @@ def open_source(
     >>> len(source.array.positions_m), source.sequence.alarm.asked_alpha
     (56, 0.02)
     """
-    asked = settings_with(settings, budget, alpha, uncalibrated)
-    place = _place(context)
     sound, named = sound_of(path, topics or {})
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     bag = _beside(sound, topics or {}) if isinstance(sound, BagSound) and sound is not path else None
-    sensors = SourceSensors.of(array, car, camera)
-    drive = _read(odometry or sensors.car.odometry, read_odometry)
-    if drive is None and bag is not None:
-        drive = bag.ego
+    place, sensors = _place(context), SourceSensors.of(array, car, camera)
+    asked = sensors.boxes_in(settings_with(settings, budget, alpha, uncalibrated), detector)
+    drive = _read(odometry or sensors.car.odometry, read_odometry) or (None if bag is None else bag.ego)
     driven = moving_ego or (drive is not None and drive.moves)
     moves = bool(driven or (recording and recording.moving_ego) or place.ego_speed_mps)
     given = sensors.car.array if bag is None else needed_array(bag.sound, sensors.car.array or named)
@@ -483,10 +480,6 @@ def open_source(
     if chosen is None and driven:
         _LOG.warning("the model of a moving ego vehicle is used, because odometry is given")
     heard_by, known = _array_and_model(sound, given, chosen, asked, moves)
-    read = _read_without(asked) if known is None else _read_by(known, asked, moves, heard_by)
-    asked = sensors.boxes_in(asked, detector)
-    if isinstance(read["sequence"], SequenceModel) and asked.azimuth_span_deg is None:
-        asked = replace(asked, azimuth_span_deg=_READ_SPAN_DEG)
     several, one = sensors.reported(detections, detector, None if bag is None else bag.detections)
     if sensors.camera is None and (one, detector) != (None, None):
         check_mounting(heard_by)
@@ -495,7 +488,6 @@ def open_source(
         array=heard_by,
         detections=None,
         context=place,
-        settings=asked,
         camera=sensors.camera or PinholeCamera.ovad(),
         miss_rates=_read(miss_rates or sensors.setup.miss_rates, load_miss_rates),
         before=_read(resume, read_checkpoint),
@@ -503,7 +495,7 @@ def open_source(
         others=(*others, *measured, *(() if drive is None else [drive.told.__iter__])),
         crossing_m=sensors.car.crossing_m,
         **_timed(sound, recording, start_s),
-        **read,
+        **_read_by(known, asked, moves, heard_by),
     )
     if several:
         return with_cameras(source, sensors.car, several)
@@ -607,16 +599,12 @@ class SourceSensors:
         name = next(iter(known.cameras), None) if camera is None else str(camera)
         if name is None:
             return cls(known, None, CameraSetup(), False)
-        setup = known.setups.get(name, CameraSetup())
-        return cls(known, known.camera(name), setup, camera is not None)
+        return cls(known, known.camera(name), known.setups.get(name, CameraSetup()), camera is not None)
 
     def boxes_in(self, settings: ListenSettings, detector: str | Detector | None = None) -> ListenSettings:
         """Return the settings with the boxes that are used of the camera, or of a detector of motion."""
-        if isinstance(detector, str) and detector in MOTION:
-            return replace(settings, boxes=any_motion())
-        return (
-            settings if self.setup.boxes == DetectionFilter() else replace(settings, boxes=self.setup.boxes)
-        )
+        boxes = any_motion() if isinstance(detector, str) and detector in MOTION else self.setup.boxes
+        return _with_boxes(settings, boxes)
 
     def reported(
         self,
@@ -740,22 +728,22 @@ def _array_and_model(
     return array, shipped if fits else None
 
 
-def _read_without(settings: ListenSettings) -> dict[str, Any]:
-    """Return the fields of a source without a model; refuse settings that need one."""
-    asked = {"budget": settings.budget, "alpha": settings.alpha, "grounding": settings.grounding}
-    for name in (name for name, value in asked.items() if value is not None):
-        raise InvalidArgumentError(f"{name}: expected a model for the array. {TRAIN}")
-    return {"model": None, "policy": uncalibrated_policy(), "sequence": None}
-
-
-def _read_by(model: Model, settings: ListenSettings, moves: bool, array: MicrophoneArray) -> dict[str, Any]:
-    """Return the fields of a source with a model, its alarm set to the settings."""
+def _read_by(
+    model: Model | None, settings: ListenSettings, moves: bool, array: MicrophoneArray
+) -> dict[str, Any]:
+    """Return the fields of a source that its model and the settings give; refuse settings without a model."""
+    if model is None:
+        asked = {"budget": settings.budget, "alpha": settings.alpha, "grounding": settings.grounding}
+        for name in (name for name, value in asked.items() if value is not None):
+            raise InvalidArgumentError(f"{name}: expected a model for the array. {TRAIN}")
+        return {"model": None, "policy": uncalibrated_policy(), "settings": settings}
     sequence, policies = _sequence_of(model, moves, settings.uncalibrated), model.policies
     usual = next((one for one in policies.policies if one.alpha == _ALPHA), policies.policies[0])
     kinds = None
     if isinstance(sequence, SequenceModel):
         sequence = sequence.asking(settings.budget, settings.alpha)
         kinds = {one.kind: one.detected for one in model.provenance.kinds}
+        settings = replace(settings, azimuth_span_deg=settings.azimuth_span_deg or _READ_SPAN_DEG)
     elif settings.budget is not None:
         raise InvalidArgumentError(f"budget: expected a model with a sequence ({sequence.reason})")
     elif settings.alpha is not None:
@@ -764,15 +752,9 @@ def _read_by(model: Model, settings: ListenSettings, moves: bool, array: Microph
         usual = replace(usual, alpha=0.0)
     if model.street is None:
         _LOG.warning(NO_STREET)
-    return {
-        "model": model.signature,
-        "policy": usual,
-        "guard": model.guard,
-        "road_users": model.road_users,
-        "sequence": sequence,
-        "street": model.street,
-        "kinds": kinds,
-    }
+    parts = {name: getattr(model, name) for name in ("guard", "road_users", "street")}
+    alarm = {"model": model.signature, "policy": usual, "sequence": sequence, "kinds": kinds}
+    return parts | alarm | {"settings": settings}
 
 
 def _sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> SequenceModel | NotUsable:
@@ -800,21 +782,28 @@ def _with_camera(
 ) -> Source:
     """Return the source with the detections of one camera, on the clock of the sound, and its degradation."""
     video = None if recording is None else recording.path / VIDEO_NAME
-    camera, rates, degradation = source.camera, source.miss_rates, source.degradation
+    rates, log = source.miss_rates, detections
     if detector is None:
         if detections is None and recording is not None:
-            detections, image_rate_hz = recording.detections_path, FRAME_RATE_HZ
-        size_px = camera.width_px, camera.height_px
-        log = _read(detections, lambda path: read_any_detections(path, image_rate_hz, size_px))
+            log, image_rate_hz = recording.detections_path, FRAME_RATE_HZ
         if video is not None and rates is not None and rates.health is not None and video.is_file():
-            degradation = video_degradation(open_video(video), rates, source.start_ns)
+            source = replace(source, degradation=video_degradation(open_video(video), rates, source.start_ns))
     elif detections is not None or video is None:
         raise InvalidArgumentError("detector: expected a recording folder with a video and no detections")
     else:
         log, degradation = seen_in(open_video(video), detector, rates, source.start_ns)
+        source = replace(source, degradation=degradation)
+    return _with_log(source, log, image_rate_hz)
+
+
+def _with_log(source: Source, given: Detections | None, image_rate_hz: float | None) -> Source:
+    """Return the source with the detections of its camera, on the clock of the sound."""
+    camera = source.camera
+    size_px = camera.width_px, camera.height_px
+    log = _read(given, lambda path: read_any_detections(path, image_rate_hz, size_px))
     if log is not None:
         log = within_images(camera, log.on_clock(source.start_ns, camera.stamp_offset_s))
-    return replace(source, detections=log, degradation=degradation)
+    return replace(source, detections=log)
 
 
 def with_cameras(source: Source, car: CarSensors, detections: Mapping[str, Detections]) -> Source:
@@ -822,20 +811,13 @@ def with_cameras(source: Source, car: CarSensors, detections: Mapping[str, Detec
     channels = {}
     for name, reported in detections.items():
         camera, setup = car.camera(name), car.setups.get(name, CameraSetup())
-        if camera is None:
-            raise InvalidArgumentError(f"detections: expected a car with cameras, it has none named {name}")
-        size_px, rate_hz = (camera.width_px, camera.height_px), setup.image_rate_hz
-        log = reported
-        if isinstance(log, Path | str):
-            log = read_any_detections(log, rate_hz, size_px)
-        own = setup.boxes != DetectionFilter()
         rates = source.miss_rates if setup.miss_rates is None else load_miss_rates(setup.miss_rates)
-        asked = replace(
-            source,
-            camera=camera,
-            detections=log.on_clock(source.start_ns, camera.stamp_offset_s),
-            miss_rates=rates,
-            settings=replace(source.settings, boxes=setup.boxes) if own else source.settings,
-        )
-        channels[name] = asked.camera_channel()
+        settings = _with_boxes(source.settings, setup.boxes)
+        one = replace(source, camera=camera, miss_rates=rates, settings=settings)
+        channels[name] = _with_log(one, reported, setup.image_rate_hz).camera_channel()
     return replace(source, co_evidence=SeveralCameras(channels))
+
+
+def _with_boxes(settings: ListenSettings, boxes: DetectionFilter) -> ListenSettings:
+    """Return settings with the boxes that a camera states, if it states any."""
+    return settings if boxes == DetectionFilter() else replace(settings, boxes=boxes)

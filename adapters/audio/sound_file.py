@@ -90,11 +90,10 @@ class Audio(ABC):
 
     def check_silence(self, strict: bool) -> None:
         """Refuse silent channels; if not strict, only if at least half of the channels are silent."""
-        if self.silent_channels and strict:
-            raise SilentChannelsError(self.path, self.silent_channels, "every channel")
-        if 2 * len(self.silent_channels) > self.channels:
-            most = f"at least half of {self.channels} channels"
-            raise SilentChannelsError(self.path, self.silent_channels, most)
+        silent = self.silent_channels
+        if silent and (strict or 2 * len(silent) > self.channels):
+            expected = "every channel" if strict else f"at least half of {self.channels} channels"
+            raise SilentChannelsError(self.path, silent, expected)
 
 
 class AudioSource(Audio):
@@ -127,12 +126,8 @@ class AudioSource(Audio):
     """
 
     def __init__(self, path: Path, file: Any) -> None:
-        self._file = file
-        self._floating = file.subtype in FLOATING
-        self.path = path
-        self.sample_rate_hz = int(file.samplerate)
-        self.channels = int(file.channels)
-        self.frames = int(file.frames)
+        self.path, self._file, self._floating = path, file, file.subtype in FLOATING
+        self.sample_rate_hz, self.channels, self.frames = file.samplerate, file.channels, file.frames
         self.silent_channels: tuple[int, ...] = ()
 
     def blocks(self, frames: int = 4800) -> Iterator[Float32Array]:
@@ -280,21 +275,21 @@ def _open_plain(path: Path) -> PlainSamples | None:
     """Open a file whose header does not match its data, with a warning; refuse a truncated file."""
     if (plain := plain_samples(path)) is None:
         return None
-    numbers = plain.declared_bytes, plain.n_bytes
     with ExitStack() as opened:
         opened.callback(plain.close)
         for stated in (name for name, kind in SUBTYPES.items() if kind == plain.subtype):
             check_encoding(str(path), plain.look, stated, plain.channels)
+        declared, there = plain.declared_bytes, plain.there_bytes
+        if plain.n_bytes > there:
+            problem = f"cut short: expected {declared} bytes of samples by its header, got {there}"
+            raise InputFileError(path, f"{problem}; `sox --ignore-length IN OUT` keeps the existing samples")
+        if not plain.needed:
+            return None
+        if declared != plain.n_bytes:
+            told = "%s: its header states %d bytes of samples, but the file has %d: all of them are read"
+            _LOG.warning(told, path, declared, plain.n_bytes)
         opened.pop_all()
-    if not plain.needed or plain.n_bytes > plain.there_bytes:
-        plain.close()
-    if plain.n_bytes > plain.there_bytes:
-        problem = f"cut short: expected {numbers[0]} bytes of samples by its header, got {plain.there_bytes}"
-        raise InputFileError(path, f"{problem}; `sox --ignore-length IN OUT` keeps the existing samples")
-    if plain.needed and numbers[0] != numbers[1]:
-        told = "%s: its header states %d bytes of samples, but the file has %d: all of them are read"
-        _LOG.warning(told, path, *numbers)
-    return plain if plain.needed else None
+    return plain
 
 
 def constant_channels(first: Float32Array) -> tuple[int, ...]:
@@ -460,9 +455,9 @@ class PcmAudio(Audio):
         while (missing := wanted - sum(map(len, parts))) and (data := self._raw.stream.read(missing)):
             parts.append(data)
         joined = b"".join(parts)
-        if len(joined) % self._raw.frame_bytes:
-            got = f"{len(joined) % self._raw.frame_bytes} bytes too many"
-            raise InputFileError(self.path, f"expected whole samples of {self.channels} channels, got {got}")
+        if more := len(joined) % self._raw.frame_bytes:
+            expected = f"expected whole samples of {self.channels} channels"
+            raise InputFileError(self.path, f"{expected}, got {more} bytes too many")
         return joined
 
     def _block(self, data: bytes) -> Float32Array:

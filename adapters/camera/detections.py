@@ -630,8 +630,8 @@ def read_any_detections(
     try:
         with refused_as_file(name):
             of_list = text.lstrip().startswith("[")
-            document = _results(text) if of_list else decode_json(text, "a detections file")
-            return coco_log(name, document, frame_rate_hz, n_images, size_px)
+            read = _results(text) if of_list else decode(_CocoFile, decode_json(text, "a file"), "COCO")
+            return _coco_log(name, read, frame_rate_hz, n_images, size_px)
     except InputFileError as error:
         raise InputFileError(error.path, f"{error.problem}; {_FORMS}") from error
 
@@ -650,12 +650,12 @@ def _results(text: str) -> "_CocoFile":
     return _CocoFile(tuple(found))
 
 
-def coco_log(
+def _coco_log(
     path: Path,
-    document: object,
-    frame_rate_hz: float | None = None,
-    n_images: int | None = None,
-    size_px: tuple[int, int] | None = None,
+    read: _CocoFile,
+    frame_rate_hz: float | None,
+    n_images: int | None,
+    size_px: tuple[int, int] | None,
 ) -> DetectionLog:
     """Return the log of COCO results, or of an object of ``"images"`` and results as ``"annotations"``.
 
@@ -664,28 +664,23 @@ def coco_log(
     ordered by the numbers at the end of their ``"file_name"`` or id; a listed size must equal `size_px`.
     Categories without names are COCO's, which start at 1, or YOLO's if one is 0.
     """
-    with refused_as_file(path):
-        held = {"annotations": document} if isinstance(document, list) else document
-        read = held if isinstance(held, _CocoFile) else decode(_CocoFile, held, "COCO")
-        listed, images = read.images is not None, read.images
-        if images is None:
-            images = tuple(map(_CocoId, {one.image_id: 0 for one in read.annotations}))
-        for one in images:
-            if size_px is not None and (one.width or size_px[0], one.height or size_px[1]) != size_px:
-                expected = f"expected images of the camera's {size_px[0]} x {size_px[1]} px"
-                way_on = "width_px and height_px of the camera are those of its images"
-                raise InvalidArgumentError(f"{expected}, got {one.width} x {one.height}: {way_on}")
-        numbers, names = _image_numbers(images, listed=listed), _category_names(read)
-        rows: dict[int, list[Row]] = {number: [] for number in numbers.values()} if listed else {}
-        for result in read.annotations:
-            if result.image_id not in numbers:
-                problem = f"expected the images of all boxes listed, {result.image_id} is not"
-                raise InvalidArgumentError(problem)
-            left, top, width, height = result.bbox
-            label = names.get(result.category_id, result.category_id)
-            score = 1.0 if result.score is None else result.score
-            row = (left, top, left + width, top + height), score, label
-            rows.setdefault(numbers[result.image_id], []).append(row)
+    listed, images = read.images is not None, read.images
+    if images is None:
+        images = tuple(map(_CocoId, {one.image_id: 0 for one in read.annotations}))
+    for one in images:
+        if size_px is not None and (one.width or size_px[0], one.height or size_px[1]) != size_px:
+            expected = f"expected images of the camera's {size_px[0]} x {size_px[1]} px"
+            way_on = "width_px and height_px of the camera are those of its images"
+            raise InvalidArgumentError(f"{expected}, got {one.width} x {one.height}: {way_on}")
+    numbers, names = _image_numbers(images, listed=listed), _category_names(read)
+    rows: dict[int, list[Row]] = {number: [] for number in numbers.values()} if listed else {}
+    for result in read.annotations:
+        if result.image_id not in numbers:
+            raise InvalidArgumentError(f"expected the images of all boxes listed, {result.image_id} is not")
+        left, top, width, height = result.bbox
+        label = names.get(result.category_id, result.category_id)
+        row = (left, top, left + width, top + height), 1.0 if result.score is None else result.score, label
+        rows.setdefault(numbers[result.image_id], []).append(row)
     if unscored := sum(one.score is None for one in read.annotations):
         _LOG.warning("%s: %d boxes without a score count with 1.0", path, unscored)
     if listed and n_images is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from worldstate.abduction.signature.window_classes import CLASSES
 from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.files.acoustic_domain import domain_of
-from worldstate.adapters.files.file_io import number, read_rows
+from worldstate.adapters.files.file_io import check_row, number, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_rate_hz, published_feature
 from worldstate.frontend.spectra.resampling import Resampler
@@ -82,10 +82,8 @@ def extract_features(windows: list[LabelledWindow], array: MicrophoneArray) -> I
         heard_hz = feature_rate_hz(rate_hz)
         if heard_hz != rate_hz:
             resampler = Resampler(array.n_microphones, rate_hz, heard_hz)
-            samples, heard_hz = (
-                np.concatenate([resampler.push(samples), resampler.flush()]),
-                resampler.rate_hz,
-            )
+            samples = np.concatenate([resampler.push(samples), resampler.flush()])
+            heard_hz = resampler.rate_hz
         yield published_feature(samples, array, heard_hz)
 
 
@@ -129,18 +127,12 @@ def _last_second(source: AudioSource, window: LabelledWindow) -> Float32Array:
 
 
 def _labelled(name: Path, root: Path, line: int, row: dict[str, str]) -> LabelledWindow:
-    if row["Class"] not in CLASSES:
-        raise InputFileError(name, f"line {line}: expected a class {CLASSES}, got {row['Class'][:40]!r}")
-    for column in ("ID", "Environment", "Recording ID"):
-        if not row[column]:
-            raise InputFileError(name, f"line {line}: expected a value of {column}")
+    filled = [(f"a value of {key}", row[key], row[key]) for key in ("ID", "Environment", "Recording ID")]
+    check_row(name, line, (f"a class {CLASSES}", row["Class"], row["Class"] in CLASSES), *filled)
     end_s = number(name, line, row, "End") if row.get("End") else None
-    if end_s is not None and end_s <= 0:
-        raise InputFileError(name, f"line {line}: expected End > 0 s, got {end_s}")
-    where = _sound_file(name, root, line, row)
-    t0_frame = t0_of(name, line, row)
+    check_row(name, line, ("End > 0 s", end_s, end_s is None or end_s > 0.0))
     origin = row["ID"], row["Class"], row["Environment"], row["Recording ID"]
-    return LabelledWindow(*origin, t0_frame, where, end_s)
+    return LabelledWindow(*origin, t0_of(name, line, row), _sound_file(name, root, line, row), end_s)
 
 
 def _sound_file(name: Path, root: Path, line: int, row: dict[str, str]) -> Path:
@@ -148,9 +140,8 @@ def _sound_file(name: Path, root: Path, line: int, row: dict[str, str]) -> Path:
     candidates = [row["File"]] if row.get("File") else [folder, f"{row['ID']}.wav"]
     for candidate in candidates:
         relative = PurePosixPath(candidate)
-        if relative.is_absolute() or ".." in relative.parts:
-            problem = f"line {line}: expected a file inside the data set, got {candidate!r:.80}"
-            raise InputFileError(name, problem)
+        outside = relative.is_absolute() or ".." in relative.parts
+        check_row(name, line, ("a file inside the data set", candidate, not outside))
         if (root / relative).is_file():
             return root / relative
     raise InputFileError(name, f"line {line}: expected a file {' or '.join(candidates)} in the data set")
@@ -189,16 +180,11 @@ def _windows(recording: Recording, number: str, fronts: int) -> list[LabelledWin
     label, place, frame = recording.label, recording.environment, recording.logged_frame
     if label is None or place is None or frame is None:
         return []
-    front_id = f"0{recording.recording_id[1:5]}{fronts:04d}"
+    ids = {FRONT: f"0{recording.recording_id[1:5]}{fronts:04d}"}
+    ends_s = window_ends_s(label, frame / FRAME_RATE_HZ, bool(recording.moving_ego))
     return [
         LabelledWindow(
-            window_id=front_id if what == FRONT else recording.recording_id,
-            label=what,
-            environment=place,
-            recording=number,
-            t0_frame=frame,
-            path=recording.audio_path,
-            end_s=end_s,
+            *(ids.get(what, recording.recording_id), what, place, number, frame), recording.audio_path, end_s
         )
-        for what, end_s in window_ends_s(label, frame / FRAME_RATE_HZ, bool(recording.moving_ego)).items()
+        for what, end_s in ends_s.items()
     ]

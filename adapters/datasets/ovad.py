@@ -18,7 +18,7 @@ from worldstate.adapters.audio.sound_file import AudioSource, open_audio
 from worldstate.adapters.camera.detections import DetectionLog, read_detections
 from worldstate.adapters.files.array_file import named_arrays, read_array
 from worldstate.adapters.files.array_match import array_difference, microphone_order
-from worldstate.adapters.files.file_io import read_json, read_rows
+from worldstate.adapters.files.file_io import check_row, read_json, read_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError, OutOfDomainError
 from worldstate.ground.typing import BoolArray, FloatArray
@@ -190,14 +190,14 @@ def _recording(log: Path, line: int, row: dict[str, str]) -> Recording:
     identifier, environment, side, t0 = (row[column] for column in COLUMNS)
     label = LABELS.get(side)
     number_fits = T0.fullmatch(t0) and int(t0) <= MAX_T0_FRAME
-    for expected, got, fits in (
+    check_row(
+        log,
+        line,
         ("an ID such as 1_00_0002", identifier, IDENTIFIER.fullmatch(identifier)),
         ("an Environment such as SA1 or DB3", environment, ENVIRONMENT.fullmatch(environment)),
         ("Class left, none or right", side, label),
         ("T0 as a frame number, an integer", t0, number_fits or (label == "none" and not t0)),
-    ):
-        if not fits:
-            raise InputFileError(log, f"line {line}: expected {expected}, got {got!r}")
+    )
     folder = log.parent / environment / side / identifier
     return Recording(folder, identifier, environment, label, int(t0) if t0 else None)
 

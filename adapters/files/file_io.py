@@ -369,10 +369,10 @@ def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
     return data
 
 
-def read_json(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> object:
+def read_json(path: str | Path, what: str) -> object:
     """Return the content of a JSON file, strictly decoded."""
     with refused_as_file(path):
-        return decode_json(read_text(path, what, max_bytes), what)
+        return decode_json(read_text(path, what, MAX_BYTES), what)
 
 
 def read_record(kind: type[T], path: str | Path, what: str, *, by_hand: bool = False) -> T:
@@ -460,6 +460,13 @@ def number(path: str | Path, line: int, row: dict[str, str], column: str) -> flo
         problem = f"line {line}: expected a finite number as {column}, got {row[column][:40]!r}"
         raise InputFileError(path, problem)
     return value
+
+
+def check_row(path: str | Path, line: int, *cells: tuple[str, object, object]) -> None:
+    """Refuse the first cell that does not fit, given as what is expected, the cell, and whether it fits."""
+    for expected, got, fits in cells:
+        if not fits:
+            raise InputFileError(path, f"line {line}: expected {expected}, got {got!r:.60}")
 
 
 def _places(

@@ -131,16 +131,14 @@ class CarSensors:
     measurements: Mapping[str, Path] = field(default_factory=dict)
     crossing_m: float = 9.0
 
-    def camera(self, name: str | None = None) -> PinholeCamera | None:
-        """Return a camera by its name; by default the first one, None without cameras.
+    def camera(self, name: str) -> PinholeCamera:
+        """Return a camera by its name.
 
         Raises
         ------
         InvalidArgumentError
             If no camera has this name.
         """
-        if name is None:
-            return next(iter(self.cameras.values()), None)
         return self.cameras[one_of("camera", name, self.cameras)]
 
 
@@ -192,14 +190,15 @@ def write_aligned(
         If no camera has this name.
     """
     car = read_car(path)
-    if car.camera(camera) is None:
+    if not car.cameras:
         raise InputFileError(path, "expected a camera to align, but there is none")
+    named = next(iter(car.cameras)) if camera is None else one_of("camera", camera, car.cameras)
     document: Any = read_json(path, "a car file")
     here, there = Path(path).absolute().parent, Path(out).absolute().parent
     file = (document.get("array") or {}).get("file")
     if file is not None and here != there and not Path(file).is_absolute():
         raise InputFileError(out, f"expected a file in {here}, where {file} is")
-    one = next(each for each in document["cameras"] if camera is None or each["name"] == camera)
+    one = next(each for each in document["cameras"] if each["name"] == named)
     one["stamp_offset_s"] = round((one.get("stamp_offset_s") or 0.0) + offset_s, 4)
     one["yaw_deg"] = round((one.get("yaw_deg") or 0.0) + yaw_deg, 3)
     write_json(out, document, indent=1)

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from worldstate.adapters.camera.class_names import class_name, may_be
 from worldstate.adapters.camera.detections import (
-    coco_log,
     read_any_detections,
     read_detections,
     read_mot_text,
@@ -238,7 +237,8 @@ def test_ground_truth_in_mot_text_has_classes_and_vehicles_without_visibility(tm
 
 def test_class_numbers_follow_the_file_format(tmp_path: Path) -> None:
     def coco(*numbers: object) -> tuple[str, ...]:
-        return coco_log(tmp_path, [RESULT | {"category_id": k} for k in numbers]).frames[0].labels
+        rows = [RESULT | {"category_id": k} for k in numbers]
+        return read_any_detections(written(tmp_path / "c.json", rows)).frames[0].labels
 
     def yolo(*numbers: int) -> tuple[str, ...]:
         (tmp_path / "000000.txt").write_text("\n".join(f"{k} 0.5 0.5 0.1 0.2 0.9" for k in numbers))
@@ -259,9 +259,10 @@ def test_class_numbers_follow_the_file_format(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size_px", [(640, 402), (1280, 720), (1936, 1217), (3840, 2412)])
 def test_listed_images_must_have_the_size_of_the_camera(size_px: tuple[int, int], tmp_path: Path) -> None:
     listed = {"images": [{"id": 0, "width": size_px[0], "height": size_px[1]}], "annotations": []}
-    assert len(coco_log(tmp_path, listed, size_px=size_px)) == 1
+    path = written(tmp_path / "c.json", listed)
+    assert len(read_any_detections(path, size_px=size_px)) == 1
     with pytest.raises(InputFileError, match=f"got {size_px[0]} x {size_px[1]}: width_px and height_px"):
-        coco_log(tmp_path, listed, size_px=(1936, 1216))
+        read_any_detections(path, size_px=(1936, 1216))
 
 
 def test_images_that_a_detector_found_empty_are_looks(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_bearings_of_a_tilted_array_are_in_vehicle_axes(tmp_path):
 def test_cameras_have_names_and_positions_relative_to_the_array(tmp_path):
     car = read_car(written(tmp_path, CAR))
     assert list(car.cameras) == ["front", "left"]
-    assert car.camera() is car.cameras["front"]
+    assert car.camera("front") is car.cameras["front"]
     assert car.cameras["front"].position_m == pytest.approx((0.8, 0.0, -0.4))
     assert car.cameras["left"].position_m == pytest.approx((0.3, 0.8, -0.4))
     assert math.degrees(car.cameras["left"].yaw_rad) == pytest.approx(60.0)
