@@ -16,8 +16,6 @@ from worldstate.frontend.array.microphone_array import ChannelMask
 from worldstate.ground import BoolArray, FloatArray, NotUsable, mean
 from worldstate.ground.typing import Float32Array, IndexArray
 
-DropoutKind = Literal["still", "splice", "repeat"]
-
 # Number of examined channels, evenly spaced: a dropout is at the same sample in all channels.
 _PICKED = 8
 # Shortest run of constant samples, and the probability of such a run in quantised sound.
@@ -51,7 +49,7 @@ class Dropout:
 
     # "still": no channel changes; "splice": samples are missing, so the sound jumps; "repeat": the samples
     # are a copy of earlier ones.
-    kind: DropoutKind
+    kind: Literal["still", "splice", "repeat"]
     sample: int  # First sample, from the start of the stream
     # Length, for a repeat accurate to about ten samples; None for a splice, whose length is unknown.
     n_samples: int | None
@@ -76,11 +74,12 @@ class DropoutFinder:
 
     def push(self, samples: Float32Array, alive: BoolArray) -> list[Dropout]:
         """Process the samples (n, M) of a hop; `alive` are the channels (M,) that are not constant in it."""
-        start = self._n_seen - len(self._tail)
-        sound = self._picked(samples, alive)
-        self._tail = samples[-2:].copy()
-        first = self._n_seen
-        self._n_seen += len(samples)
+        first, start = self._n_seen, self._n_seen - len(self._tail)
+        # Some live channels, shape (channels, n), preceded by the end of the last hop.
+        every = max(-(-int(np.add.reduce(alive)) // _PICKED), 1)
+        picks = slice(None, None, every) if False not in alive else np.flatnonzero(alive)[::every]
+        sound = np.ascontiguousarray(np.concatenate([self._tail[:, picks], samples[:, picks]]).T)
+        self._tail, self._n_seen = samples[-2:].copy(), first + len(samples)
         change = sound[:, 1:] - sound[:, :-1]
         still = np.logical_and.reduce(change == 0.0)
         dropouts = self._still.push(still[-len(samples) :], self._n_seen)
@@ -91,12 +90,6 @@ class DropoutFinder:
         for begin, end in (*self._still.runs, self._repeats.run):
             self.lost[max(begin - first, 0) : max(end - first, 0)] = True
         return sorted(dropouts, key=lambda dropout: dropout.sample)
-
-    def _picked(self, samples: Float32Array, alive: BoolArray) -> Float32Array:
-        """Return some live channels, shape (channels, n), preceded by the end of the last hop."""
-        every = max(-(-int(np.add.reduce(alive)) // _PICKED), 1)
-        picks = slice(None, None, every) if False not in alive else np.flatnonzero(alive)[::every]
-        return np.ascontiguousarray(np.concatenate([self._tail[:, picks], samples[:, picks]]).T)
 
 
 class StillRuns:
@@ -153,7 +146,11 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
     """
     # With d the differences of successive samples, e their prediction errors and J the jump over two samples,
     # a splice has a J above 12 and above three times the fifth largest J of the hop.
-    error = _prediction_error(change)
+    # The error of the best first-order prediction for all channels together, on the flat array: the few
+    # products across channel boundaries are negligible.
+    flat = change.ravel()
+    power, product = float(flat @ flat), float(flat[1:] @ flat[:-1])
+    error = change[:, 1:] - np.float32(product / power if power > 0.0 else 0.0) * change[:, :-1]
     np.square(error, out=error)
     error /= np.maximum(mean(error, 1), _TINY)[:, None]
     # An upper bound of J is sufficient for a clean hop.
@@ -166,15 +163,6 @@ def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dro
     found = np.flatnonzero((jump > limit) & ~near_still)
     apart = found[np.diff(found, prepend=-100) > 50]
     return [Dropout("splice", int(start + 2 + index), None) for index in apart]
-
-
-def _prediction_error(change: Float32Array) -> Float32Array:
-    """Return the error of the best first-order prediction of the differences, for all channels together."""
-    # Computed on the flat array; the few products across channel boundaries are negligible.
-    flat = change.ravel()
-    power, product = float(flat @ flat), float(flat[1:] @ flat[:-1])
-    rule = np.float32(product / power if power > 0.0 else 0.0)
-    return np.asarray(change[:, 1:] - rule * change[:, :-1])
 
 
 class RepeatFinder:
@@ -230,9 +218,7 @@ class RepeatFinder:
         return hashes[where].tolist(), (where + start).tolist()
 
     def _repeat(self, lags: list[tuple[int, int]]) -> list[Dropout]:
-        if len(lags) < _MIN_ANCHORS:
-            return []
-        lag, count = Counter(lag for lag, _ in lags).most_common(1)[0]
+        lag, count = next(iter(Counter(lag for lag, _ in lags).most_common(1)), (0, 0))
         if count < _MIN_ANCHORS:
             return []
         places = [place for found, place in lags if found == lag]

@@ -241,13 +241,14 @@ class ChannelMonitor:
         self._dropouts: tuple[Dropout, ...] = ()
         self._n_dropouts = 0
         self._geometry_check = GeometryCheck(array, frequencies_hz)
-        self._extremes: tuple[Float32Array, Float32Array] = (np.zeros(n, np.float32),) * 2
+        self._span = np.zeros(n, np.float32)
 
     def find_lost(self, samples: Float32Array) -> BoolArray:
         """Process the samples (n, M) of a hop; return which of them are lost in all channels, (n,)."""
-        self._extremes = lowest, highest = _extremes(samples)
+        lowest, highest = _extremes(samples)
+        self._span = highest - lowest
         self._clipping.push(samples, lowest, highest)
-        dropouts = self._dropout_finder.push(samples, highest > lowest)
+        dropouts = self._dropout_finder.push(samples, self._span > 0.0)
         self._n_dropouts += len(dropouts)
         self._dropouts = (*self._dropouts, *dropouts)[-_KEPT_DROPOUTS:]
         return self._dropout_finder.lost
@@ -266,32 +267,22 @@ class ChannelMonitor:
         # E is the mean square of a frame and channel, E~ that of the median channel, s the peak-to-peak value
         # and s-bar its running mean. A channel is excluded from the hop if it is silent, fails or crackles in
         # it, or if it has one of `MASKED_FAULTS`.
-        lowest, highest = self._extremes
-        span = highest - lowest
-        alive = span > 0.0
+        alive = self._span > 0.0
         if not len(energies):
-            return self._report(np.zeros(len(span), bool) if alive.any() else self._activity.all_silent())
-        silent = self._silent(energies, alive)
+            return self._report(np.zeros(len(alive), bool) if alive.any() else self._activity.all_silent())
+        silent, some = ~alive, True in alive
+        if some:
+            typical = np.maximum(median(energies[:, alive]), _TINY)[:, None]
+            failed = np.logical_or.reduce(energies < _DROPPED * typical)
+            silent = silent | (mean(energies / typical, 0) < _SILENT) | failed
         self._levels.push(mean(powers, 0, np.float64), ~silent)
-        bad = self._judge_hop(samples, span, silent)
+        bad = self._judge_hop(samples, alive, silent) if some else self._activity.all_silent()
         self._geometry_check.push(matrices, len(energies), ~self._activity.suspects)
         return self._report(bad)
 
-    def _silent(self, energies: FloatArray, alive: BoolArray) -> BoolArray:
-        """Return the channels that are silent in this hop or fail in it."""
-        if True not in alive:
-            return ~alive
-        typical = np.maximum(median(energies[:, alive]), _TINY)[:, None]
-        level = mean(energies / typical, 0)
-        return np.asarray(~alive | (level < _SILENT) | np.logical_or.reduce(energies < _DROPPED * typical))
-
-    def _judge_hop(self, samples: Float32Array, span: Float32Array, silent: BoolArray) -> BoolArray:
-        """Return the channels that are silent or crackle in this hop."""
-        alive = span > 0.0
-        if True not in alive:
-            return self._activity.all_silent()
-        bad = silent.copy()
-        mean_span = self._means[0]
+    def _judge_hop(self, samples: Float32Array, alive: BoolArray, silent: BoolArray) -> BoolArray:
+        """Return the channels that are silent, fail or crackle in this hop."""
+        bad, span, mean_span = silent.copy(), self._span, self._means[0]
         known = alive & (mean_span > 0.0)
         if True in known:
             growth = np.divide(span, mean_span, out=np.zeros(len(span)), where=known)
@@ -313,9 +304,9 @@ class ChannelMonitor:
         keep = ~bad
         for fault in faults:
             keep[fault.channel] &= fault.fault not in MASKED_FAULTS
-        dropouts = self._dropouts, self._n_dropouts
-        coherence, clipped = self._geometry_check.coherence, self._clipping.newest_share
-        return ArrayHealth(ChannelMask(keep), tuple(faults), *dropouts, coherence, clipped)
+        found = tuple(faults), self._dropouts, self._n_dropouts
+        coherence, clipped = self._geometry_check.fit.coherence, self._clipping.newest_share
+        return ArrayHealth(ChannelMask(keep), *found, coherence, clipped)
 
     def _single_channel_faults(self) -> list[ChannelFault]:
         """Return faults that are visible on a single channel: clipping, offset, level, gusts."""

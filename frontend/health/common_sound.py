@@ -104,7 +104,8 @@ class CommonSound:
         if not np.array_equal(kept, self._kept):
             self._choose(kept)
         if self._n_frames > _LEAST_FRAMES:
-            self._compare_noise()
+            if self._decides:
+                self._compare_noise()
             if self._hops % _EVERY_HOPS == 0 and np.count_nonzero(kept) > 2:
                 self._compare_places()
         share = min(self._common)
@@ -114,8 +115,6 @@ class CommonSound:
 
     def _compare_noise(self) -> None:
         """Store the share of sound without independent noise, from the whole band and from its bins."""
-        if not self._decides:
-            return
         noise, (scatter, scatter_of_all) = self._noise / self._n_frames**2, self._scatter
         power = np.square(self._sum.real) + np.square(self._sum.imag)
         power *= self._chosen

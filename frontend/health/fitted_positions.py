@@ -122,7 +122,8 @@ def fit_positions(checks: Sequence[PositionCheck], usable: BoolArray) -> FittedP
         parts < LEAST_PARTS and f"2 s of coherent sound, got {parts / 4:.2g} s",
     )
     step = 2 if parts >= 2 * LEAST_PARTS else 1
-    fitted, judged = (first.comparison(usable, np.concatenate(heard)[half::step]) for half in (0, step - 1))
+    parted = (np.concatenate(heard)[half::step] for half in (0, step - 1))
+    fitted, judged = (Comparison(first, usable, part) for part in parted)
     given = first.positions_m[usable] - first.positions_m[usable].mean(axis=0)
     start = max(_starts(given, fitted), key=lambda one: fitted.explained(one).sum())
     found = _descent(start, fitted)

@@ -5,7 +5,6 @@ Plane waves give the directions of the sound and, for many channels, the order t
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -90,20 +89,20 @@ _ORDER_MEMORY_S = 20
 # microphones 8 cm or more apart are exchanged.
 _GAIN_OF_MANY = 0.04
 
-Pair = tuple[int, int]
-
 
 class OrderCheck:
     """Compares the order of the channels with orders in which two are exchanged, once per second."""
 
     def __init__(self, beams: Complex64Array) -> None:
         self._beams = beams
-        self._gains: dict[Pair, deque[float]] = {}
+        self._gains: dict[tuple[int, int], deque[float]] = {}
 
-    def push(self, coherence: Complex64Array, proposed: Iterable[ChannelFault]) -> None:
+    def push(self, coherence: Complex64Array, proposed: Iterable[ChannelFault]) -> list[ChannelFault]:
         r"""Process the coherence (K, M, M) of one second, with zero diagonal, and the exchanges to test.
 
         .. math:: G_{ab} = \ln \frac{\sum_d \max(P_d^{(ab)}, 0)^2}{\sum_d \max(P_d, 0)^2}
+
+        Return the channels whose exchange makes the beams sharper.
         """
         exchanges = ((one.channel, one.looks_like) for one in proposed if one.looks_like is not None)
         pairs = tuple({(min(pair), max(pair)) for pair in exchanges})
@@ -113,9 +112,6 @@ class OrderCheck:
         for pair, gain in zip(pairs, gains.tolist(), strict=True):
             self._gains[pair] = before.get(pair, deque(maxlen=_ORDER_MEMORY_S))
             self._gains[pair].append(gain)
-
-    def faults(self) -> list[ChannelFault]:
-        """Return the channels whose exchange makes the beams sharper."""
         means = sorted((float(np.mean(gains)), pair) for pair, gains in self._gains.items())
         return [
             ChannelFault(one, Fault.SWAPPED, gain, looks_like=other)
@@ -148,15 +144,6 @@ def sharpness_gains(coherence: Complex64Array, beams: Complex64Array, pairs: Ind
 
 
 _FLAT = 1e-9
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Card:
-    """Consecutive channels, such as those of one sound card, and the value by which they differ."""
-
-    channels: BoolArray  # shape (M,)
-    amount: float
-    sensitivity: float  # Length of the part of its pattern that no other sound direction explains
 
 
 def untilted(positions_m: FloatArray, known: BoolArray) -> FloatArray:
@@ -203,18 +190,23 @@ def _untilted_runs(positions_m: bytes, known: bytes) -> tuple[FloatArray, FloatA
     return free, np.add.reduce(candidates @ free * candidates, 1)
 
 
-def best_card(values: FloatArray, power: FloatArray, candidates: FloatArray) -> Card:
-    r"""Return the run of channels that explains most of the projected values.
+def best_card(
+    values: FloatArray, power: FloatArray, candidates: FloatArray
+) -> tuple[BoolArray, float, float]:
+    r"""Return the consecutive channels, such as those of one sound card, that explain most of the values.
 
     .. math:: \hat c = \arg\max_c \frac{(c^T v)^2}{c^T Q c}, \qquad \hat a = \frac{c^T v}{c^T Q c}
 
-    Shapes: values (M,), power (R,), c^T Q c of the candidates (R, M).
+    Return the channels (M,), the amount by which they differ, and the length of the part of their pattern
+    that no other sound direction explains.
+
+    Shapes: values (M,), projected, power (R,), c^T Q c of the candidates (R, M).
     """
     # If a sound direction explains all but a twentieth of a pattern, noise would give a large value.
     power = np.where(power > 0.05 * candidates.sum(axis=1), power, np.inf)
     found = candidates @ values
     best = int((found**2 / power).argmax())
-    return Card(candidates[best] > 0.0, float(found[best] / power[best]), float(np.sqrt(power[best])))
+    return candidates[best] > 0.0, float(found[best] / power[best]), float(np.sqrt(power[best]))
 
 
 # Delays tested in one second, added to those of the seconds before: half a period of 700 Hz.
@@ -333,38 +325,31 @@ class DelayCheck:
         if len(seconds) < _MIN_DRIFT_S:
             return []
         time = seconds - seconds.mean()
-        card = best_card(free @ (time @ values) / (time @ time), power, self._runs[self._is_card])
-        error = _slope_error(time, values @ card.channels / card.sensitivity**2)
-        length = abs(card.amount) * card.sensitivity * (np.ptp(seconds) / _DRIFT_SPAN_S) ** 1.5
-        if abs(card.amount) < max(_DRIFT, _SIGMAS * error) or length < _DRIFT_LENGTH:
+        some = self._runs[self._is_card]
+        card, amount, sensitivity = best_card(free @ (time @ values) / (time @ time), power, some)
+        # Standard deviation of the slope of a line: sigma^2 = sum e^2 / ((n - 2) sum (t - mean t)^2).
+        path = values @ card / sensitivity**2
+        rest = path - path.mean() - (time @ path) / (time @ time) * time
+        error = float(np.sqrt((rest @ rest) / (len(time) - 2) / (time @ time)))
+        length = abs(amount) * sensitivity * (np.ptp(seconds) / _DRIFT_SPAN_S) ** 1.5
+        if abs(amount) < max(_DRIFT, _SIGMAS * error) or length < _DRIFT_LENGTH:
             return []
-        return _named(card, Fault.DRIFT, error)
+        return _named(card, Fault.DRIFT, amount, error)
 
     def _late(self, values: FloatArray, free: FloatArray, power: FloatArray) -> list[ChannelFault]:
         if len(values) < _MIN_DELAY_S:
             return []
-        card = best_card(free @ np.median(values, axis=0), power, self._runs)
-        amount, length = abs(card.amount), abs(card.amount) * card.sensitivity
-        least_s = max(_DELAY_S, _LONE_DELAY_S / float(np.sqrt(np.count_nonzero(card.channels))))
-        if amount < least_s or length < _DELAY_RMS_S * np.sqrt(len(free)):
+        card, amount, sensitivity = best_card(free @ np.median(values, axis=0), power, self._runs)
+        least_s = max(_DELAY_S, _LONE_DELAY_S / float(np.sqrt(np.count_nonzero(card))))
+        if abs(amount) < least_s or abs(amount) * sensitivity < _DELAY_RMS_S * np.sqrt(len(free)):
             return []
-        paths = values @ card.channels / card.sensitivity**2
+        paths = values @ card / sensitivity**2
         # Standard deviation of a median.
-        return _named(card, Fault.DELAY, 1.25 * float(paths.std()) / np.sqrt(len(paths)))
+        return _named(card, Fault.DELAY, amount, 1.25 * float(paths.std()) / np.sqrt(len(paths)))
 
 
-def _slope_error(time: FloatArray, path: FloatArray) -> float:
-    r"""Return the standard deviation of the slope of a line through (n,) points.
-
-    .. math:: \sigma^2 = \frac{\sum e^2}{(n - 2) \sum (t - \bar t)^2}
-    """
-    rest = path - path.mean() - (time @ path) / (time @ time) * time
-    return float(np.sqrt((rest @ rest) / (len(time) - 2) / (time @ time)))
-
-
-def _named(card: Card, fault: Fault, std: float) -> list[ChannelFault]:
-    channels = np.flatnonzero(card.channels).tolist()
-    return [ChannelFault(channel, fault, card.amount, std=std) for channel in channels]
+def _named(card: BoolArray, fault: Fault, amount: float, std: float) -> list[ChannelFault]:
+    return [ChannelFault(channel, fault, amount, std=std) for channel in np.flatnonzero(card).tolist()]
 
 
 # Incoherent power of a usable channel relative to the field: delay mismatch and self-noise of real arrays.
@@ -471,7 +456,10 @@ class PositionFit:
 
     def evaluate(self, active: BoolArray) -> None:
         """Search for faults among the active channels, (M,)."""
-        self._use(active & ~self._suspects)
+        usable = active & ~self._suspects
+        # The weights are stored because they take a few milliseconds.
+        if not np.array_equal(usable, self._usable):
+            self._usable, self._weights = usable, position_weights(*self._geometry, usable)
         scores = position_scores(self._sum / np.float32(self._n_frames), self._weights)
         typical = float(np.median(scores.diagonal()[self._usable])) if self._usable.any() else 0.0
         heard = typical >= _MIN_COHERENCE
@@ -479,21 +467,14 @@ class PositionFit:
         found = self._find(scores, typical, active) if heard else []
         self.faults, self._found = repeated(found, self._found)
 
-    def _use(self, usable: BoolArray) -> None:
-        """Predict from these channels only; the weights are stored because they take a few milliseconds."""
-        if not np.array_equal(usable, self._usable):
-            self._usable = usable
-            self._weights = position_weights(*self._geometry, usable)
-
     def _find(self, scores: FloatArray, typical: float, active: BoolArray) -> list[ChannelFault]:
         limit = typical * np.where(self._suspects, _WELL, _SUSPECT)
         own = scores.diagonal()
         inverted = active & (own < -limit)
         swapped = displaced(scores, active & ~inverted & (scores.max(axis=1) > 0.5 * limit))
-        noisy = active & ~inverted & (own < limit)
-        noisy[[fault.channel for fault in swapped]] = False
-        self._suspects = noisy | inverted
-        self._suspects[[fault.channel for fault in swapped]] = True
+        moved = np.isin(np.arange(len(own)), [fault.channel for fault in swapped])
+        noisy = active & ~inverted & ~moved & (own < limit)
+        self._suspects = noisy | inverted | moved
         both = ((Fault.NOISY, noisy), (Fault.INVERTED, inverted))
         return swapped + [one for kind, found in both for one in faults_where(kind, found, own / typical)]
 
@@ -548,7 +529,7 @@ class GeometryCheck:
         self._bins = high[:: max(-(-len(high) // most), 1)]
         chosen = frequencies_hz[self._bins]
         waves = PlaneWaves(array.centred_m, chosen, _directions())
-        self._fit = PositionFit(array, frequencies_hz)
+        self.fit = PositionFit(array, frequencies_hz)
         self._order, self._delay = OrderCheck(waves.beams), DelayCheck(array, waves, chosen)
         self._sum = np.zeros((len(chosen), n, n), np.complex64)
         self._hops, self._n_frames = 0, 0
@@ -556,22 +537,17 @@ class GeometryCheck:
         self._by_waves: list[ChannelFault] = []
         self.faults: list[ChannelFault] = []  # One per channel, the more specific one
 
-    @property
-    def coherence(self) -> float | NotUsable:
-        """Median over the channels of the coherence with the prediction from the others."""
-        return self._fit.coherence
-
     def push(self, matrices: Complex64Array, n_frames: int, active: BoolArray) -> None:
         r"""Add the cross-spectra (K, M, M) of one hop, summed over frames, and the active channels (M,).
 
         .. math:: R_{ij} = \frac{1}{T} \sum_t Z_i \overline{Z_j}
         """
-        self._fit.add(matrices, n_frames)
+        self.fit.add(matrices, n_frames)
         self._sum += matrices[self._bins]
         self._n_frames += n_frames
         self._hops += 1
         if self._hops % _EVERY_HOPS == 0:
-            self._fit.evaluate(active)
+            self.fit.evaluate(active)
             self._compare_waves(active)
             self._sum[...] = 0.0
             self._n_frames = 0
@@ -585,16 +561,17 @@ class GeometryCheck:
             return
         self._delay.push(coherence, active)
         many = len(active) > MAX_CHANNELS
-        self._order.push(coherence, [one for one in self._fit.faults if many and one.fault is Fault.SWAPPED])
+        proposed = [one for one in self.fit.faults if many and one.fault is Fault.SWAPPED]
+        exchanged = self._order.push(coherence, proposed)
         confirmed, self._late = repeated(self._delay.faults(), self._late)
         # Exchanged channels also look late.
-        self._by_waves = self._order.faults() or confirmed
+        self._by_waves = exchanged or confirmed
 
     def _most_specific(self) -> list[ChannelFault]:
         # Microphones 0.5 m apart hardly predict each other, so a noisy channel must also match no wave.
         incoherent = self._delay.incoherent
-        inverted = [one for one in self._fit.faults if one.fault is Fault.INVERTED]
-        noisy = [one for one in self._fit.faults if one.fault is Fault.NOISY and incoherent[one.channel]]
+        inverted = [one for one in self.fit.faults if one.fault is Fault.INVERTED]
+        noisy = [one for one in self.fit.faults if one.fault is Fault.NOISY and incoherent[one.channel]]
         crossed = {one.channel for one in inverted}
         found = [one for one in self._by_waves if one.channel not in crossed]
         elsewhere = {one.channel for one in found}

@@ -159,10 +159,10 @@ class PositionCheck:
         bands = min(max(_BANDS // n, _FEWEST), _MOST, len(bins) // wide)
         first = np.linspace(0, len(bins) - wide, bands).astype(int)
         self._bands = first[:, None] + np.arange(wide)
-        self._frequencies = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
+        self.frequencies_hz = bin_frequencies_hz(bins, sample_rate_hz, nfft)[self._bands].mean(axis=1)
         self._frames_a_part = round(2.0 * _PART_S * sample_rate_hz / nfft)
         # Mean square of independent noise by chance.
-        self._noise = 1.0 / (self._frames_a_part * wide)
+        self.noise = 1.0 / (self._frames_a_part * wide)
         self._stft = StreamingStft(n, nfft, bins)
         self._parts: list[tuple[float, Complex64Array]] = []
 
@@ -177,7 +177,7 @@ class PositionCheck:
                 by_band = part.transpose(1, 0, 2, 3).reshape(len(self._bands), -1, part.shape[-1])
                 coherence = cross_spectra(by_band) / np.float32(by_band.shape[1])
                 np.einsum("kmm->km", coherence)[...] = 0.0
-                self._parts.append((_power(coherence) - self._noise, coherence))
+                self._parts.append((_power(coherence) - self.noise, coherence))
         if len(self._parts) > 2 * _PARTS:
             self._parts = self._strongest()
 
@@ -187,12 +187,8 @@ class PositionCheck:
     def heard(self) -> Complex64Array:
         """Return the coherence (S, K, M, M) of the most coherent parts."""
         kept = [coherence for power, coherence in self._strongest() if power > _COHERENT]
-        shape = len(self._frequencies), len(self.positions_m), len(self.positions_m)
+        shape = len(self.frequencies_hz), len(self.positions_m), len(self.positions_m)
         return np.asarray(kept, np.complex64).reshape(-1, *shape)
-
-    def comparison(self, usable: BoolArray, heard: Complex64Array) -> "Comparison":
-        """Return a comparison of hypotheses for the usable channels (M,), from coherence as in `heard`."""
-        return Comparison(self.positions_m, self._frequencies, np.flatnonzero(usable), heard, self._noise)
 
     def verdict(self, usable: BoolArray, heard_from_rad: float | None = None) -> PositionVerdict:
         """Check order and size of the usable channels (M,), and the mounting with sound of known azimuth."""
@@ -202,7 +198,7 @@ class PositionCheck:
         if len(heard) < LEAST_PARTS:
             few = f"{_PART_S * len(heard):.2g} s of coherent sound, 2 s are needed"
             return PositionVerdict(unjudged=(f"order and size: {few}",))
-        return self.comparison(usable, heard).verdict(heard_from_rad)
+        return Comparison(self, usable, heard).verdict(heard_from_rad)
 
 
 def _power(coherence: Complex64Array) -> float:
@@ -212,21 +208,15 @@ def _power(coherence: Complex64Array) -> float:
 
 
 class Comparison:
-    """Comparison of hypotheses for some channels, (m,), on the same parts, coherence (S, K, M, M)."""
+    """Comparison of hypotheses for the usable channels, (m,), on the same parts, coherence (S, K, M, M)."""
 
-    def __init__(
-        self,
-        positions_m: FloatArray,
-        frequencies_hz: FloatArray,
-        channels: IndexArray,
-        coherence: Complex64Array,
-        noise: float,
-    ) -> None:
-        self._positions = positions_m[channels] - positions_m[channels].mean(axis=0)
-        self._frequencies, self._channels = frequencies_hz, channels
+    def __init__(self, check: PositionCheck, usable: BoolArray, coherence: Complex64Array) -> None:
+        self._channels = channels = np.flatnonzero(usable)
+        self._positions = check.positions_m[channels] - check.positions_m[channels].mean(axis=0)
+        self._frequencies = check.frequencies_hz
         self._coherence = coherence[:, :, channels][..., channels]
-        self._power = (_power(self._coherence) - noise) * self._coherence[..., 0, 0].size
-        self._claimed = Hypothesis(self._positions, frequencies_hz)
+        self._power = (_power(self._coherence) - check.noise) * self._coherence[..., 0, 0].size
+        self._claimed = Hypothesis(self._positions, self._frequencies)
 
     def explained(self, positions_m: FloatArray) -> FloatArray:
         """Return the share of the total coherent energy that positions (m, 3) explain in each part, (S,)."""
