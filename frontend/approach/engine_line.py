@@ -77,18 +77,13 @@ def best_path(ratio: FloatArray, bin_hz: float) -> FloatArray:
     # Half a resolution at the highest partial, so that no partial is between two candidates.
     step = 0.5 / (WINDOW_S * BAND_HIGH_HZ)
     grid = np.geomspace(LOW_HZ, HIGH_HZ, int(np.log(HIGH_HZ / LOW_HZ) / step) + 2)
-    evidence = _harmonic_evidence(ratio, grid, bin_hz)
-    reach = max(1, int(np.ceil(_MOST_RATE_HZ * STEP_S / step)))
-    return np.asarray(grid[_viterbi(evidence, reach)])
-
-
-def _harmonic_evidence(ratio: FloatArray, grid: FloatArray, bin_hz: float) -> FloatArray:
     gain = np.log1p(ratio) - _PARTIAL_PRICE
     evidence = np.zeros((len(ratio), len(grid)))
     for h in range(1, MOST_HARMONICS + 1):
         inside = h * grid <= BAND_HIGH_HZ
         evidence[:, inside] += gain[:, np.round(h * grid[inside] / bin_hz).astype(np.intp)]
-    return evidence
+    reach = max(1, int(np.ceil(_MOST_RATE_HZ * STEP_S / step)))
+    return np.asarray(grid[_viterbi(evidence, reach)])
 
 
 def _viterbi(evidence: FloatArray, reach: int) -> IndexArray:
@@ -129,12 +124,6 @@ class HarmonicTrack:
     misfit: FloatArray
     level_db: FloatArray  # Power of all partials, 10 log10, relative to samples of unit mean square
     windows: int  # Number of analysed windows, K of them usable
-
-    def usable(self) -> "HarmonicTrack":
-        """Return the track with only the windows that have a partial."""
-        found = self.n_partials > 0
-        columns = (one.name for one in fields(self) if one.name != "windows")
-        return replace(self, **{name: getattr(self, name)[found] for name in columns})
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,18 +196,17 @@ def _partial(
     windows: Windows, demodulated: Complex128Array, expected_hz: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return frequency, variance and power of a partial in each window; infinite variance if too weak."""
-    n, turns = windows.n, windows.rate_hz / (2 * np.pi)
+    n, w, turns = windows.n, windows.shape, windows.rate_hz / (2 * np.pi)
     shift, peak = _newton_shift(demodulated, n)
-    floor = _floor_at(windows, expected_hz)
+    bins = np.round(expected_hz * ZERO_PADDING * len(n) / windows.rate_hz).astype(np.intp)
+    floor = windows.floor[np.arange(len(bins)), np.minimum(bins, windows.floor.shape[1] - 1)]
     snr = peak / floor
     use = (snr >= _LEAST_SNR) & (np.abs(shift) < 2 * np.pi * REACH / len(n)) & (expected_hz <= BAND_HIGH_HZ)
-    variance = _line_variance(windows.shape, n) / np.maximum(snr, 1.0) * turns**2
+    # Variance of the peak of a windowed periodogram, (rad per sample)^2 at unit SNR.
+    spread = np.sum(w**2 * n**2) / np.sum(w * n**2) ** 2
+    unit = float(0.5 * w.sum() ** 2 / np.sum(w**2) * spread)
+    variance = unit / np.maximum(snr, 1.0) * turns**2
     return expected_hz + shift * turns, np.where(use, variance, np.inf), np.where(use, peak - floor, 0.0)
-
-
-def _floor_at(windows: Windows, frequency: FloatArray) -> FloatArray:
-    bins = np.round(frequency * ZERO_PADDING * len(windows.shape) / windows.rate_hz).astype(np.intp)
-    return np.asarray(windows.floor[np.arange(len(bins)), np.minimum(bins, windows.floor.shape[1] - 1)])
 
 
 def _newton_shift(demodulated: Complex128Array, n: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -231,12 +219,6 @@ def _newton_shift(demodulated: Complex128Array, n: FloatArray) -> tuple[FloatArr
     step = np.divide(-slope, curvature, out=np.sign(slope) * reach, where=curvature < 0)
     step = np.clip(step, -reach, reach)
     return step, np.maximum(height + slope * step + 0.5 * curvature * step**2, height)
-
-
-def _line_variance(window: FloatArray, n: FloatArray) -> float:
-    """Return the variance of the peak of a windowed periodogram, (rad per sample)^2 at unit SNR."""
-    spread = np.sum(window**2 * n**2) / np.sum(window * n**2) ** 2
-    return float(0.5 * window.sum() ** 2 / np.sum(window**2) * spread)
 
 
 # Each pass measures along the track and the slope of the previous pass.
@@ -307,7 +289,9 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
     for _ in range(PASSES):
         found = measure_fundamental(windows, fundamental, _slope(time, fundamental))
         fundamental = np.where(found.n_partials > 0, found.frequency_hz, fundamental)
-    return found.usable()
+    usable = found.n_partials > 0
+    columns = (one.name for one in fields(found) if one.name != "windows")
+    return replace(found, **{name: getattr(found, name)[usable] for name in columns})
 
 
 def _slope(time: FloatArray, frequency: FloatArray) -> FloatArray:

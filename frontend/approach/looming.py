@@ -148,42 +148,38 @@ def approach_rate(
     level = float(mean(energies))
     scale = float(np.exp(-level))
     design = np.array([np.ones(len(times)), times])
-    exponential = _fit_line(design, energies - level, None)
+    log_slope, _, log_scatter = _fit_line(design, energies - level, None)
     source = _fit_source(design, np.exp(energies - level), noise_energy * scale)
     if source is None:
         return NotUsable("range reaches zero within the window")
-    if min(exponential.scatter, source.scatter) > MAX_LOG_STD:
+    at_end, slope, scatter, unit, by_noise = source
+    if min(log_scatter, scatter) > MAX_LOG_STD:
         return NotUsable("energy scatters by more than 3 dB about the fit")
-    if source.level**-2 < _LEAST_RATIO * noise_energy * scale:
+    if at_end**-2 < _LEAST_RATIO * noise_energy * scale:
         return NotUsable(f"the source has less than {_LEAST_RATIO} times the energy of the noise")
-    scatter, noise_std = max(source.scatter, floor_std), noise_energy_std * scale
-    covariance = scatter**2 * source.covariance + noise_std**2 * source.by_noise[:, None] * source.by_noise
-    if source.level < _MIN_RANGE_SIGMA * math.sqrt(covariance[0, 0]):
+    scatter, noise_std = max(scatter, floor_std), noise_energy_std * scale
+    covariance = scatter**2 * unit + noise_std**2 * by_noise[:, None] * by_noise
+    if at_end < _MIN_RANGE_SIGMA * math.sqrt(covariance[0, 0]):
         return NotUsable("range reaches zero within the error of the window")
-    rate = -source.slope / source.level
-    gradient = np.array([-rate, -1.0]) / source.level
-    return Looming(rate, math.sqrt(gradient @ covariance @ gradient), exponential.slope)
+    rate = -slope / at_end
+    gradient = np.array([-rate, -1.0]) / at_end
+    return Looming(rate, math.sqrt(gradient @ covariance @ gradient), log_slope)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Source:
-    """Energy ``(level + slope t)^-2`` of a source, with the errors of its parameters."""
+def _fit_source(
+    design: FloatArray, energy: FloatArray, noise: float
+) -> tuple[float, float, float, FloatArray, FloatArray] | None:
+    """Fit E = N + (a + b t)^-2 with errors proportional to E; None if the range reaches zero.
 
-    level: float
-    slope: float
-    scatter: float  # Relative deviation of the energies
-    covariance: FloatArray  # shape (2, 2): For a relative deviation of one
-    by_noise: FloatArray  # shape (2,): Derivative with respect to the noise
-
-
-def _fit_source(design: FloatArray, energy: FloatArray, noise: float) -> _Source | None:
-    """Fit E = N + (a + b t)^-2 with errors proportional to E; None if the range reaches zero."""
+    Return a, b, the relative deviation of the energies, the covariance of (a, b) for a relative deviation of
+    one, (2, 2), and the derivative of (a, b) by the noise, (2,).
+    """
     # Gauss-Newton from the line through E^(-1/2).
     excess = np.log(np.maximum(energy - noise, _LEAST_EXCESS * energy))
     # Weights from the smooth exponential fit, because weights from the noisy values would bias the line.
-    times, smooth = design[1], _fit_line(design, excess, None)
-    line = _fit_line(design, np.exp(-0.5 * excess), np.exp(smooth.level + smooth.slope * times))
-    level, slope = line.level, line.slope
+    times, (smooth_slope, smooth_level, _) = design[1], _fit_line(design, excess, None)
+    weights = np.exp(smooth_level + smooth_slope * times)
+    slope, level, _ = _fit_line(design, np.exp(-0.5 * excess), weights)
     for _ in range(_STEPS + 1):
         # A straight line has its minimum at one end.
         ranges, ends = level + slope * times, (level + slope * times[0], level + slope * times[-1])
@@ -200,20 +196,13 @@ def _fit_source(design: FloatArray, energy: FloatArray, noise: float) -> _Source
         level, slope = level + steps[0], slope + steps[1]
     # The residuals are those before the last step, which is too small to matter.
     scatter = math.sqrt(residual @ residual / (len(times) - 2))
-    return _Source(level, slope, scatter, covariance, -covariance @ (jacobian @ weights))
+    return level, slope, scatter, covariance, -covariance @ (jacobian @ weights)
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """Line ``value = level + slope t``."""
-
-    slope: float
-    level: float
-    scatter: float
-
-
-def _fit_line(design: FloatArray, values: FloatArray, weights: FloatArray | None) -> _Line:
-    """Fit a line in closed form to rows of ones and of times, by (weighted) least squares."""
+def _fit_line(
+    design: FloatArray, values: FloatArray, weights: FloatArray | None
+) -> tuple[float, float, float]:
+    """Fit a line to rows of ones and of times by (weighted) least squares; return slope, level, deviation."""
     weighted = design if weights is None else design * weights
     (s0, s1), (_, s2) = (weighted @ design.T).tolist()
     v0, v1 = (weighted @ values).tolist()
@@ -221,8 +210,7 @@ def _fit_line(design: FloatArray, values: FloatArray, weights: FloatArray | None
     slope, level = (s0 * v1 - s1 * v0) / determinant, (s2 * v0 - s1 * v1) / determinant
     squared = (values - level - slope * design[1]) ** 2
     total = np.add.reduce(squared) if weights is None else squared @ weights
-    scatter = math.sqrt(total / (len(values) - 2))
-    return _Line(slope, level, scatter)
+    return slope, level, math.sqrt(total / (len(values) - 2))
 
 
 # An approach is audible for three to six seconds. The lower third of half a minute is therefore noise; that

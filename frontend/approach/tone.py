@@ -254,7 +254,13 @@ class ToneStage:
         self._decimator = Decimator(sample_rate_hz, high)
         self._rate = self._decimator.rate_hz
         self._n_out = 0
-        self._band_samples: FloatArray = np.zeros(_window(_WINDOW_S * sample_rate_hz, self._decimator))
+        # The number of outputs that always fit into the samples of a window.
+        n_samples, n_taps = _WINDOW_S * sample_rate_hz, self._decimator.n_taps
+        count = int((n_samples - n_taps) // self._decimator.factor)
+        if count < 2 * _PADDING * _RING[1]:
+            expected = f"a filter well below {n_samples:.0f} samples"
+            raise InvalidArgumentError(f"tone_band_hz: expected {expected}, got {n_taps}")
+        self._band_samples: FloatArray = np.zeros(count)
         self._spectrum = _Spectrum(len(self._band_samples), self._rate, band_hz)
 
     def push(self, samples: Float32Array, mask: ChannelMask) -> None:
@@ -300,15 +306,6 @@ class ToneStage:
         chosen = self._array.nearest(keep)[:_MOST_CHANNELS]
         self._keep, self._weights = keep.copy(), np.zeros(len(keep), np.float32)
         self._weights[chosen] = 1.0 / len(chosen)
-
-
-def _window(n_samples: float, decimator: Decimator) -> int:
-    """Return the number of outputs that always fit into this many input samples."""
-    count = int((n_samples - decimator.n_taps) // decimator.factor)
-    if count < 2 * _PADDING * _RING[1]:
-        expected = f"a filter well below {n_samples:.0f} samples"
-        raise InvalidArgumentError(f"tone_band_hz: expected {expected}, got {decimator.n_taps}")
-    return count
 
 
 class _Spectrum:

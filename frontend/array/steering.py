@@ -141,17 +141,13 @@ def interpolation_nodes(vectors: Complex128Array) -> tuple[IndexArray, FloatArra
         worst = int(rest.argmax())
         if rest[worst] <= limit:
             return index[:n].copy(), np.linalg.solve(rows[:n, index[:n]], rows[:n])
-        kernel = _kernel(vectors, worst) - rows[:n, worst] @ rows[:n]
+        # G between this direction and all.
+        inner = (vectors[:, None, :, worst].conj() @ vectors)[:, 0]
+        kernel = (np.square(inner.real) + np.square(inner.imag)).sum(axis=0) - rows[:n, worst] @ rows[:n]
         index[n], rows[n] = worst, kernel / np.sqrt(rest[worst])
         rest = rest - np.square(rows[n])
         rest[index[: n + 1]] = 0.0
     return None
-
-
-def _kernel(vectors: Complex128Array, index: int) -> FloatArray:
-    """Return G between one direction and all, (directions,)."""
-    inner = (vectors[:, None, :, index].conj() @ vectors)[:, 0]
-    return np.asarray((np.square(inner.real) + np.square(inner.imag)).sum(axis=0))
 
 
 def _thin_basis(weights: Complex128Array, max_rank: int) -> Complex128Array | None:

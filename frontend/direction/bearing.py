@@ -39,7 +39,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.spectra.stft import whiten
 from worldstate.ground.checks import check_shape
-from worldstate.ground.typing import Complex64Array, FloatArray, IndexArray
+from worldstate.ground.typing import Complex64Array, FloatArray
 from worldstate.ground.values import median, vertex, wrap_angle
 
 _TINY = np.finfo(np.float64).tiny
@@ -231,7 +231,9 @@ def find_peaks(values: FloatArray, azimuths_rad: FloatArray, max_peaks: int = 4)
     if values.max() <= 0.0:
         return ()
     middle = max(float(median(values)), _TINY)
-    candidates = _local_maxima(values)
+    # Local maxima; for a plateau the first index.
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    candidates = ((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:])).nonzero()[0]
     highest = candidates[(-values[candidates]).argsort(kind="stable")][:max_peaks].tolist()
     peaks = [_interpolate(values, azimuths_rad, index, middle) for index in highest]
     return tuple([peak for peak in peaks if peak.prominence >= 1.0])
@@ -260,12 +262,6 @@ def about_the_peak(values: FloatArray, azimuths_rad: FloatArray) -> tuple[FloatA
     step, count = azimuths_rad[1] - azimuths_rad[0], len(values) - 1
     order = int(values[:-1].argmax()) - count // 2 + np.arange(count)
     return values[:-1].take(order, mode="wrap"), azimuths_rad[0] + step * order
-
-
-def _local_maxima(values: FloatArray) -> IndexArray:
-    """Return the indices of local maxima; for a plateau the first index."""
-    padded = np.concatenate([[-np.inf], values, [-np.inf]])
-    return ((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:])).nonzero()[0]
 
 
 def _interpolate(values: FloatArray, azimuths: FloatArray, index: int, median: float) -> Peak:
@@ -323,14 +319,11 @@ def _std_rad(spectrum: FloatArray, best: Peak, azimuths_rad: FloatArray) -> floa
     # Within the peak's own lobe there is no other direction.
     density[peak - _width(excess[peak::-1]) : peak + _width(excess[peak:]) + 1] = 0.0
     others = float(density @ np.square(wrap_angle(azimuths_rad - best.azimuth_rad)))
-    moved = _DISPLACEMENT * _top_width(excess, peak) * float(azimuths_rad[1] - azimuths_rad[0]) / ratio
-    return math.hypot(_LEAST_STD_RAD, moved, math.sqrt(others))
-
-
-def _top_width(excess: FloatArray, peak: int) -> float:
-    """Return the width of the parabola through a peak, in grid steps; infinite at an end of the grid."""
+    # Width of the parabola through the peak, in grid steps; infinite at an end of the grid.
     fall = 3.0 * excess[peak] - excess[peak - 1 : peak + 2].sum()
-    return 1.0 / math.sqrt(fall) if 0 < peak < len(excess) - 1 and fall > 0.0 else math.inf
+    width = 1.0 / math.sqrt(fall) if 0 < peak < len(excess) - 1 and fall > 0.0 else math.inf
+    moved = _DISPLACEMENT * width * float(azimuths_rad[1] - azimuths_rad[0]) / ratio
+    return math.hypot(_LEAST_STD_RAD, moved, math.sqrt(others))
 
 
 # Number of hops between compared bearings; memory of half a minute; spread. Without the spread, a few sharp

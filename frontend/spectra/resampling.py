@@ -7,8 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from worldstate.ground import FloatArray, in_range
-from worldstate.ground.typing import Float32Array
+from worldstate.ground.typing import Float32Array, FloatArray
 
 # Attenuation of aliases, and ripple within the band: the resolution of 16-bit converters.
 _ATTENUATION_DB = 80.0
@@ -26,13 +25,13 @@ class Decimator:
     """
 
     def __init__(self, sample_rate_hz: float, high_hz: float) -> None:
-        rate = in_range("sample_rate_hz", sample_rate_hz, 0.0, np.inf, open_low=True)
-        high = in_range("high_hz", high_hz, 0.0, 0.5 * rate, open_low=True, open_high=True)
-        self.factor = max(int(rate / (_OVERSAMPLING * high)), 1)
-        self.rate_hz = rate / self.factor
-        taps = _low_pass(rate, high, self.rate_hz) if self.factor > 1 else np.ones(1)
-        self.n_taps = len(taps)
-        self._taps = taps
+        self.factor = max(int(sample_rate_hz / (_OVERSAMPLING * high_hz)), 1)
+        self.rate_hz = sample_rate_hz / self.factor
+        self._taps: FloatArray = np.ones(1)
+        if self.factor > 1:
+            transition = (self.rate_hz - 2.0 * high_hz) / (0.5 * sample_rate_hz)
+            self._taps = _kaiser_taps(_kaiser_length(transition) | 1, self.rate_hz / sample_rate_hz)
+        self.n_taps = len(self._taps)
         self._waiting: FloatArray = np.empty(0)
 
     def push(self, samples: NDArray[np.floating]) -> FloatArray:
@@ -46,11 +45,6 @@ class Decimator:
         windows = np.ndarray((n_out, self.n_taps), float, waiting, strides=(self.factor * step, step))
         # Row by row, because the last bit of a BLAS product depends on the number of rows.
         return np.asarray(np.einsum("ij,j->i", windows, self._taps))
-
-
-def _low_pass(rate: float, high: float, low_rate: float) -> FloatArray:
-    transition = (low_rate - 2.0 * high) / (0.5 * rate)
-    return _kaiser_taps(_kaiser_length(transition) | 1, low_rate / rate)
 
 
 # Kaiser window for this attenuation, and its length: J. F. Kaiser, "Nonrecursive digital filter design using

@@ -132,18 +132,16 @@ class _Lines:
         return np.concatenate([steady, tonal, self._peaks, [comb, spreads[0], pitch, spreads[1], holds]])
 
     def _moment(self, excess: FloatArray) -> FloatArray:
-        comb, strongest = self._combed(excess), int(excess.argmax())
-        height, pitch = float(excess[strongest]), float(self._log_hz[strongest])
-        weight, stands_out = math.exp(min(height, _HEIGHTS[1])), height > _HEIGHTS[0]
-        return np.array([comb, comb * comb, weight, weight * pitch, weight * pitch * pitch, stands_out])
-
-    def _combed(self, excess: FloatArray) -> float:
-        """Return the log of the highest line in the spectrum of the spectrum, relative to its mean."""
+        # The log of the highest line in the spectrum of the spectrum, relative to its mean.
         low, high = _EXCESS
         clipped = np.minimum(np.maximum(excess, low), high)
         spectrum = power(rfft(clipped * self._taper, self._comb_size))
         highest = float(np.maximum.reduce(spectrum[self._combs]))
-        return 0.5 * math.log((highest + _LEAST) / (float(mean(spectrum)) + _LEAST))
+        comb = 0.5 * math.log((highest + _LEAST) / (float(mean(spectrum)) + _LEAST))
+        strongest = int(excess.argmax())
+        height, pitch = float(excess[strongest]), float(self._log_hz[strongest])
+        weight, stands_out = math.exp(min(height, _HEIGHTS[1])), height > _HEIGHTS[0]
+        return np.array([comb, comb * comb, weight, weight * pitch, weight * pitch * pitch, stands_out])
 
 
 def _modulation(levels: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ The short-time Fourier transform covers a range of bins; the phase transform kee
 import numpy as np
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array, IntArray
+from worldstate.ground.typing import Complex64Array, ComplexArray, Float32Array
 
 # Smallest power of a bin with sound: far below 24-bit quantisation, far above float32 underflow.
 _POWER_FLOOR = np.float32(1e-30)
@@ -89,7 +89,9 @@ class StreamingStft:
         self.bins = bins
         # One more bin on each side for the taps of the window.
         wider = np.arange(bins.start - 1, bins.stop + 1)
-        self._half_dft = _half_dft(wider, nfft)
+        # The real rows, then the imaginary rows of the DFT over half a frame.
+        phase = -2.0 * np.pi / nfft * np.outer(wider, np.arange(nfft // 2))
+        self._half_dft = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
         self._signs = ((-1.0) ** wider).astype(np.float32)[:, None]
         self._head = np.empty((nfft // 2, n_channels), np.float32)
         self._n_head = 0
@@ -129,12 +131,6 @@ class StreamingStft:
         self._head[: len(tail)] = tail
         self._n_head = len(tail)
         return halves
-
-
-def _half_dft(bins: IntArray, nfft: int) -> Float32Array:
-    """Return the real rows, then the imaginary rows of the DFT over half a frame, (2 bins, nfft / 2)."""
-    phase = -2.0 * np.pi / nfft * np.outer(bins, np.arange(nfft // 2))
-    return np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
 
 
 def _frames(halves: Float32Array, signs: Float32Array) -> Complex64Array:
