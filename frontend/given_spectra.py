@@ -8,14 +8,7 @@ import numpy as np
 from worldstate.frontend.approach.looming import EnergyFloor
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, one_blas_thread
-from worldstate.frontend.direction.bearing import (
-    BearingScatter,
-    about_the_peak,
-    bearing_of,
-    find_peaks,
-    noise_prominence,
-    uniform_std_rad,
-)
+from worldstate.frontend.direction import bearing as doa
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD, FEATURE_SEGMENTS
 from worldstate.frontend.spectra.sound_character import SoundCharacter
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power
@@ -117,12 +110,16 @@ class SpectrumFrontEnd:
         self.sample_rate_hz = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
         self._start_ns, self._used = start_ns, 0
         with one_blas_thread():
-            self._least_prominence = self._noise_prominence()
-        self._rows = spectra.values
+            # As `FrontEnd` computes it for this array.
+            bins = band_bins(settings.srp_band_hz, sample_rate_hz, settings.nfft)
+            hz = bin_frequencies_hz(bins, sample_rate_hz, settings.nfft)
+            beams = [Steering.towards(spectra.array, hz, spectra.azimuths_rad)]
+            n_frames = BEARING_HOPS * 2.0 * sample_rate_hz / (HOP_RATE_HZ * settings.nfft)
+            self._least_prominence = doa.noise_prominence(beams, spectra.array, hz, n_frames)
         # The spectra at the thirty azimuths of the published feature, shape (hops, 30).
-        rows = [np.interp(FEATURE_AZIMUTHS_RAD, spectra.azimuths_rad, row) for row in spectra.values]
-        self._published = np.array(rows)
-        self._scatter = BearingScatter(uniform_std_rad(spectra.azimuths_rad))
+        published = [np.interp(FEATURE_AZIMUTHS_RAD, spectra.azimuths_rad, row) for row in spectra.values]
+        self._published = np.array(published)
+        self._scatter = doa.BearingScatter(doa.uniform_std_rad(spectra.azimuths_rad))
         self._cutter = HopCutter(1, sample_rate_hz)
         self._meter = LevelMeter(1, sample_rate_hz, settings)
         band = band_bins(LOOMING_BAND_HZ, sample_rate_hz, settings.nfft)
@@ -154,13 +151,6 @@ class SpectrumFrontEnd:
         """Raise an error, because the rows of the spectra refer to uninterrupted sound."""
         raise InvalidArgumentError(f"lost_ns: expected uninterrupted sound with spectra, got {lost_ns}")
 
-    def _noise_prominence(self) -> float:
-        """Return the prominence below which a peak is noise, as `FrontEnd` computes it for this array."""
-        rate, nfft = self.sample_rate_hz, self.settings.nfft
-        hz = bin_frequencies_hz(band_bins(self.settings.srp_band_hz, rate, nfft), rate, nfft)
-        beams = [Steering.towards(self.array, hz, self.spectra.azimuths_rad)]
-        return noise_prominence(beams, self.array, hz, BEARING_HOPS * 2.0 * rate / (HOP_RATE_HZ * nfft))
-
     def _hop(self, hop: Hop) -> AcousticFrame | None:
         levels = self._meter.push(hop.samples)
         # The mean square in the looming band of the frames that end in the hop.
@@ -169,15 +159,15 @@ class SpectrumFrontEnd:
         self._floor.push(self._energies[-1])
         if self._character is not None:
             self._character.push(hop.samples[:, 0])
-        return self._frame(hop, levels) if WINDOW_HOPS <= hop.index <= len(self._rows) else None
+        return self._frame(hop, levels) if WINDOW_HOPS <= hop.index <= len(self._published) else None
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
         each, window = self.spectra.hops, slice(hop.index - WINDOW_HOPS, hop.index)
-        rows = self._rows[window][each - 1 :: each]
+        rows = self.spectra.values[window][each - 1 :: each]
         newest = rows[-max(BEARING_HOPS // each, 1) :].mean(axis=0)
-        spectrum, azimuths = about_the_peak(newest, self.spectra.azimuths_rad)
-        peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
-        bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
+        spectrum, azimuths = doa.about_the_peak(newest, self.spectra.azimuths_rad)
+        peaks, floor = doa.find_peaks(spectrum, azimuths), self._least_prominence
+        bearing = self._scatter.widened(doa.bearing_of(spectrum, peaks, azimuths, floor))
         times_s = np.asarray((np.arange(-len(self._energies), 0) + 0.5) / HOP_RATE_HZ, np.float64)
         halves = self._published[window][each - 1 :: each].reshape(FEATURE_SEGMENTS, HALF_HOPS // each, -1)
         return AcousticFrame(

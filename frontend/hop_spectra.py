@@ -14,28 +14,14 @@ import numpy as np
 from worldstate.frontend.approach.looming import MIN_POINTS, EnergyFloor, Looming, approach_rate
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import Steering, cross_spectra
+from worldstate.frontend.direction import feature as published
 from worldstate.frontend.direction.bearing import steered_power
-from worldstate.frontend.direction.feature import (
-    FEATURE_AZIMUTHS_RAD,
-    FEATURE_BAND_HZ,
-    feature_steering,
-    pair_sum_of,
-)
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.health.common_sound import CommonSound
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz, power, whiten
-from worldstate.ground import (
-    LEAST_HEARD,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    InvalidArgumentError,
-    NotUsable,
-    falling,
-    mean,
-)
-from worldstate.ground.typing import Complex128Array, Float32Array
+from worldstate.ground import LEAST_HEARD, InvalidArgumentError, NotUsable, falling, mean
+from worldstate.ground.typing import BoolArray, Complex128Array, Float32Array, FloatArray, IntArray
 
 from .settings import ELEVATIONS_RAD, HIGHEST_SHARE, HOP_RATE_HZ, LOOMING_BAND_HZ, FrontEndSettings
 
@@ -94,8 +80,6 @@ class HopSums:
 
     heard: BoolArray  # shape (frames,): Frames without lost samples, which the sums include
     lost: float  # Share of lost samples in the hop
-    share: float  # Usable share of the hop, without lost samples and noise
-    unheard: str | None  # Reason why the rest is not usable
     centre: float  # Mean of the middles of these frames, samples from the start of the stream
     # shape (elevations * azimuths,): Steered power. If microphones are excluded, power and pairs are rescaled
     # to the value for all microphones.
@@ -105,24 +89,25 @@ class HopSums:
     health: ArrayHealth  # Faults of the array, and the microphones used
     n_frames: int  # Number of frames in the sums
     # Usable share according to coherence and positions, and the reason why the rest is not usable.
-    common: tuple[float, str | None] = (1.0, None)
+    common: tuple[float, str | None]
 
 
 def hop_window(n_hops: int, n_directions: int, n_channels: int) -> Any:
     """Return an empty window: the sums of its hops, one row per hop, oldest first, all zero."""
     numbers = [(name, float) for name in ("n_frames", "n_new", "share", "lost", "centre")]
-    pairs = ("pairs", complex, len(FEATURE_AZIMUTHS_RAD))
+    pairs = ("pairs", complex, len(published.FEATURE_AZIMUTHS_RAD))
     sums = [("power", float, n_directions), pairs, ("energies", float, n_channels)]
     return np.zeros(n_hops, [*numbers, ("unheard", object), *sums])
 
 
 def push_hop(window: Any, hop: HopSums, share: float, unheard: str | None) -> None:
     """Add the latest hop to a window, with its usable share after noise; below 0.2 its sums are empty."""
-    least = min(share, hop.share)
-    heard = least == hop.share or least >= LEAST_HEARD
+    whole = 1.0 - hop.lost
+    least = min(share, whole)
+    heard = least == whole or least >= LEAST_HEARD
     window[:-1] = window[1:]
     sums = (hop.power, hop.pairs, hop.energies) if heard else (0.0, 0.0, 0.0)
-    why = unheard if share < hop.share else hop.unheard
+    why = unheard if share < whole else "lost samples" if hop.lost else None
     window[-1] = (hop.n_frames * heard, len(hop.heard), least, hop.lost, hop.centre, why, *sums)
 
 
@@ -132,7 +117,7 @@ class HopSpectra:
     def __init__(self, array: MicrophoneArray, sample_rate_hz: float, settings: FrontEndSettings) -> None:
         nfft = settings.nfft
         self.srp_bins = band_bins(settings.srp_band_hz, sample_rate_hz, nfft)
-        self.feature_bins = band_bins(FEATURE_BAND_HZ, sample_rate_hz, nfft)
+        self.feature_bins = band_bins(published.FEATURE_BAND_HZ, sample_rate_hz, nfft)
         bands = (self.srp_bins, self.feature_bins, band_bins(LOOMING_BAND_HZ, sample_rate_hz, nfft))
         bins = range(min(b.start for b in bands), max(b.stop for b in bands))
         inside = (slice(b.start - bins.start, b.stop - bins.start) for b in bands)
@@ -140,9 +125,10 @@ class HopSpectra:
         frequencies = bin_frequencies_hz(self.srp_bins, sample_rate_hz, nfft)
         # One steering per elevation, because the rank and the number of nodes for all together are too large.
         azimuths = settings.azimuths_rad()
-        rows = (Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD)
-        self.beams = tuple(rows)
-        self._feature_beams = feature_steering(array, self.feature_bins, sample_rate_hz, nfft)
+        self.beams = [
+            Steering.towards(array, frequencies, azimuths, elevation) for elevation in ELEVATIONS_RAD
+        ]
+        self._feature_beams = published.feature_steering(array, self.feature_bins, sample_rate_hz, nfft)
         self._stft = StreamingStft(array.n_microphones, nfft, bins)
         self._nfft, self._order = nfft, settings.feature_order
         self._n_frames = 0
@@ -174,13 +160,11 @@ class HopSpectra:
         health.mask.silence(whitened)
         inside = whitened[:, self._srp]
         srp = np.concatenate([steered_power(inside, row) for row in self.beams]) * health.mask.power_scale
-        pairs = pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
+        pairs = published.pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
         pairs = pairs * health.mask.pair_scale
         mean_square = energies.sum(axis=0) / max(n_heard, 1)
         share = float(np.add.reduce(lost)) / len(lost)
-        reason = "lost samples" if share else None
-        sums = srp, pairs, mean_square
-        return HopSums(heard, share, 1.0 - share, reason, centre, *sums, health, n_heard, common)
+        return HopSums(heard, share, centre, srp, pairs, mean_square, health, n_heard, common)
 
     def _heard_frames(self, lost: BoolArray, n_new: int) -> BoolArray:
         """Return which new frames contain no lost sample; lost has shape (n,)."""

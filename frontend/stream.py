@@ -11,17 +11,7 @@ from worldstate.frontend.approach.looming import EnergyFloor, Looming
 from worldstate.frontend.approach.tone import ToneReading, ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.array.steering import one_blas_thread
-from worldstate.frontend.direction.bearing import (
-    BearingScatter,
-    Peak,
-    about_the_peak,
-    bearing_of,
-    find_peaks,
-    is_all_round,
-    noise_prominence,
-    normalised,
-    uniform_std_rad,
-)
+from worldstate.frontend.direction import bearing as doa
 from worldstate.frontend.direction.feature import FEATURE_SEGMENTS, feature_nfft, segment_feature
 from worldstate.frontend.health.channel_health import ArrayHealth
 from worldstate.frontend.hop_spectra import SILENCE, Hop, HopCutter, hop_end
@@ -114,7 +104,7 @@ class AcousticFrame:
     bearing_rad: float
     bearing_std_rad: float
     prominence: float
-    peaks: tuple[Peak, ...]
+    peaks: tuple[doa.Peak, ...]
     band_log_energy: FloatArray
     looming: Looming | NotUsable
     feature: FloatArray
@@ -132,7 +122,7 @@ class AcousticFrame:
     def at_edge(self) -> bool:
         """Whether the highest peak is at an end of the search sector, so that its source may be outside."""
         within = self.azimuths_rad[0] < self.bearing_rad < self.azimuths_rad[-1]
-        return not (within or is_all_round(self.azimuths_rad))
+        return not (within or doa.is_all_round(self.azimuths_rad))
 
 
 __all__ = ["AcousticFrame", "FrontEnd"]
@@ -226,14 +216,14 @@ class FrontEnd:
         self._start_ns = start_ns
         self._azimuths = settings.azimuths_rad()
         self._azimuths.flags.writeable = False
-        self._scatter = BearingScatter(uniform_std_rad(self._azimuths))
+        self._scatter = doa.BearingScatter(doa.uniform_std_rad(self._azimuths))
         self._cutter, self._recorder = (HopCutter(n_channels, hz) for hz in (rate, self.sample_rate_hz))
         self._recorded: deque[Float32Array] = deque()
         with one_blas_thread():
             self._spectra = HopSpectra(array, rate, settings)
             frequencies = bin_frequencies_hz(self._spectra.srp_bins, rate, settings.nfft)
             n_frames = BEARING_HOPS * 2.0 * rate / (HOP_RATE_HZ * settings.nfft)
-            self._least_prominence = noise_prominence(self._spectra.beams, array, frequencies, n_frames)
+            self._least_prominence = doa.noise_prominence(self._spectra.beams, array, frequencies, n_frames)
         self._noise = NoiseMeter(settings.mask_rises) if settings.watch_channels else None
         self._levels: FloatArray = np.full(BANDS, np.log(SILENCE))
         self._meter = LevelMeter(n_channels, rate, settings, self.sample_rate_hz)
@@ -355,7 +345,7 @@ class FrontEnd:
 
     def _unmasked(self, levels: FloatArray, newest: HopSums) -> FloatArray:
         """Add the latest hop, empty if noise masks it; return its levels, or the last usable ones."""
-        noise, share, reason = self._noise, newest.share, newest.unheard
+        noise, share, reason = self._noise, 1.0, None
         if noise is not None and newest.n_frames:
             coherence = float(mean(self._scaled(newest.pairs[None], newest.n_frames)))
             share, reason = noise.push(levels, coherence, newest.common)
@@ -367,10 +357,13 @@ class FrontEnd:
         return self._levels
 
     def _frame(self, hop: Hop, levels: FloatArray) -> AcousticFrame:
-        hops, heard = self._window, self._heard(BEARING_HOPS)
-        spectrum, azimuths = about_the_peak(self._srp(heard), self._azimuths)
-        peaks, floor = find_peaks(spectrum, azimuths), self._least_prominence
-        bearing = self._scatter.widened(bearing_of(spectrum, peaks, azimuths, floor))
+        hops = self._window
+        # The last usable hops of the window, or the last hops if none is usable.
+        heard = hops["n_frames"].nonzero()[0][-BEARING_HOPS:]
+        heard = heard if len(heard) else np.arange(WINDOW_HOPS)[-BEARING_HOPS:]
+        spectrum, azimuths = doa.about_the_peak(self._srp(heard), self._azimuths)
+        peaks, floor = doa.find_peaks(spectrum, azimuths), self._least_prominence
+        bearing = self._scatter.widened(doa.bearing_of(spectrum, peaks, azimuths, floor))
         shares = hops["share"].tolist()
         window = sum(shares) / WINDOW_HOPS
         return AcousticFrame(
@@ -397,11 +390,6 @@ class FrontEnd:
             excess_db=0.0 if self._noise is None else self._noise.excess_db,
         )
 
-    def _heard(self, n_hops: int) -> IndexArray:
-        """Return the last usable hops of the window, or the last hops if none is usable."""
-        heard = self._window["n_frames"].nonzero()[0]
-        return (heard if len(heard) else np.arange(WINDOW_HOPS))[-n_hops:]
-
     @property
     def _keep(self) -> BoolArray:
         return self._health.mask.keep
@@ -416,7 +404,7 @@ class FrontEnd:
         some = self._window[hops]
         total, n_frames = np.add.reduce(some["power"]), sum(some["n_frames"].tolist())
         n_bins, n_microphones = len(self._spectra.srp_bins), self.array.n_microphones
-        power = normalised(total, max(n_frames, 1), n_bins, n_microphones)
+        power = doa.normalised(total, max(n_frames, 1), n_bins, n_microphones)
         return np.asarray(np.maximum.reduce(power.reshape(-1, len(self._azimuths))))
 
     def _age_s(self, hops: IndexArray, end: int) -> float:

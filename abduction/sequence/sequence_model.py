@@ -60,13 +60,9 @@ class BoostedTrees:
     value: FloatArray  # shape (trees, nodes): Values of leaves
     tree_class: IndexArray  # shape (trees,): Class to whose score a tree contributes
     baseline: FloatArray  # shape (classes,)
-    # Different tests of all trees (input and threshold); per tree and test, its index among them and a mask
-    # of the leaves that remain after "no"; values of the leaves.
-    _asked: IndexArray = field(init=False, repr=False)  # shape (different tests,)
-    _limit: FloatArray = field(init=False, repr=False)  # shape (different tests,)
-    _which: IndexArray = field(init=False, repr=False)  # shape (tests, trees)
-    _left: AnyArray = field(init=False, repr=False)  # shape (tests, trees)
-    _leaves: FloatArray = field(init=False, repr=False)  # shape (trees, leaves)
+    # Different tests of all trees: input and threshold, (different tests,). Per tree and test: its index
+    # among them, and a mask of the leaves that remain after "no", (tests, trees). Values of the leaves.
+    _ordered: tuple[IndexArray, FloatArray, IndexArray, AnyArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         grid = trees, nodes = np.shape(self.split)
@@ -123,26 +119,25 @@ class BoostedTrees:
         left[at] &= ~(ruled_out << first[row, node].astype(word))
         row, node = np.nonzero(~asks & (first >= 0))
         leaves[row, first[row, node]] = self.value[row, node]
-        object.__setattr__(self, "_asked", pairs[:, 0].astype(np.intp))
-        object.__setattr__(self, "_limit", np.ascontiguousarray(pairs[:, 1]))
-        for name, value in (("_which", which.reshape(shape)), ("_left", left), ("_leaves", leaves)):
-            object.__setattr__(self, name, value)
+        tests = pairs[:, 0].astype(np.intp), np.ascontiguousarray(pairs[:, 1])
+        object.__setattr__(self, "_ordered", (*tests, which.reshape(shape), left, leaves))
 
     def scores(self, X: FloatArray) -> FloatArray:
         """Return the sums before the softmax, shape (n, inputs) -> (n, classes)."""
-        classes, (trees, leaves) = len(self.baseline), self._leaves.shape
+        asked, limit, which, after_no, leaves = self._ordered
+        classes, trees = len(self.baseline), len(leaves)
         ends = np.empty((len(X), trees), np.intp)
         # Row by row, so that the data of a row stay in the cache.
         for row, end in zip(X, ends, strict=True):
-            yes = -(row.take(self._asked) <= self._limit).astype(self._left.dtype)
-            left = np.bitwise_and.reduce(self._left | yes.take(self._which), axis=0)
+            yes = -(row.take(asked) <= limit).astype(after_no.dtype)
+            left = np.bitwise_and.reduce(after_no | yes.take(which), axis=0)
             # A number with only its lowest bit set is a power of two.
             end[:] = np.frexp((left & -left).astype(np.float64))[1]
-        ends += np.arange(trees) * leaves - 1
+        ends += np.arange(trees) * leaves.shape[1] - 1
         # `bincount`, because a matrix product with ones takes longer, and its rounding of a row depends on
         # the number of rows.
         bins = np.arange(len(X))[:, None] * classes + self.tree_class
-        sums = np.bincount(bins.ravel(), self._leaves.take(ends).ravel(), len(X) * classes)
+        sums = np.bincount(bins.ravel(), leaves.take(ends).ravel(), len(X) * classes)
         return np.asarray(self.baseline + sums.reshape(-1, classes))
 
 
