@@ -17,11 +17,13 @@ ARRAY = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.1, -0.3, 0.0]], "t
 HERE = domain_of(ARRAY, [6000.0], ["SA101"])
 
 
+def table_of(*sites: str) -> FeatureTable:
+    names, labels = np.array(sites), np.array(["left", "none", "front"])
+    return FeatureTable(np.ones((3, 60)), labels, names, names, names, (None,) * 3)
+
+
 def test_tables_of_another_array_raise_an_error() -> None:
-    names = np.array(["SA1", "SB1", "SB2"])
-    table = FeatureTable(
-        np.ones((3, 60)), np.array(["left", "none", "front"]), names, names, names, (None,) * 3
-    )
+    table = table_of("SA1", "SB1", "SB2")
     kept = windows_of_array(table, CommissionSettings(leave_out=("SB1",)), HERE)
     assert kept.environments.tolist() == ["SA1", "SB2"]
     # Without it a commissioned model would have no budget and no times.
@@ -36,10 +38,7 @@ class LearnedError(Exception):
 
 
 def test_real_windows_are_fitted_once_for_all_folds(tmp_path, monkeypatch) -> None:
-    names, fitted = np.array(["DA1", "DB1", "DB2"]), []
-    table = FeatureTable(
-        np.ones((3, 60)), np.array(["left", "none", "front"]), names, names, names, (None,) * 3
-    )
+    table, fitted = table_of("DA1", "DB1", "DB2"), []
 
     def learn(streams, fit, *rest):
         assert fit(streams[:1]) is fit(streams)
@@ -54,5 +53,5 @@ def test_real_windows_are_fitted_once_for_all_folds(tmp_path, monkeypatch) -> No
     with pytest.raises(LearnedError):
         commission.commission(ARRAY, moving, tmp_path, table=table)
     ((windows, beside),) = fitted
-    assert windows.environments.tolist() == names.tolist()
+    assert windows.environments.tolist() == table.environments.tolist()
     assert beside is None

@@ -1,6 +1,5 @@
 """Clips of users: learning, weights and errors."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +16,16 @@ from worldstate.ground.errors import InputFileError
 RATE = 16_000
 
 
-def table(folder: Path, rows: list[tuple[str, ...]]) -> Path:
-    path = folder / "clips.csv"
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([("file", "kind", "recording", "road_user"), *rows])
-    return path
+HEADER = "file", "kind", "recording", "road_user"
+
+
+def table(folder: Path, rows: list[tuple[str, ...]], header: tuple[str, ...] = HEADER) -> Path:
+    (folder / "clips.csv").write_text("\n".join(map(",".join, (header, *rows, ()))))
+    return folder / "clips.csv"
+
+
+def hops_of(rows: SoundRows) -> dict[str, int]:
+    return dict(zip(*(one.tolist() for one in np.unique(rows.kinds, return_counts=True)), strict=True))
 
 
 def pump(path: Path, seed: int) -> str:
@@ -48,9 +52,8 @@ def foreign_share(guard: DomainGuard, measures: np.ndarray) -> float:
 def test_a_learned_foreign_sound_is_detected_more_often(tmp_path: Path) -> None:
     rows = [(pump(tmp_path / f"{n}.wav", n), "pump", f"r{n}", "") for n in range(8)]
     learned = read_recorded(tmp_path, table(tmp_path, rows))
-    held_out = np.concatenate(
-        [heard_clip(tmp_path / pump(tmp_path / f"{n}.wav", n)) for n in (101, 102, 103)]
-    )
+    others = (tmp_path / pump(tmp_path / f"{n}.wav", n) for n in (101, 102, 103))
+    held_out = np.concatenate(list(map(heard_clip, others)))
     base = simulated()
     before = fit_guard(of_guard(base))
     after = fit_guard(of_guard(SoundRows.joined([base, learned.rows])))
@@ -62,74 +65,39 @@ def test_a_learned_foreign_sound_is_detected_more_often(tmp_path: Path) -> None:
 
 
 def test_recordings_have_equal_weight(tmp_path: Path) -> None:
-    rows = [
-        (pump(tmp_path / f"{n}.wav", n), *rest)
-        for n, rest in enumerate(
-            [
-                ("tram", "r0", ""),
-                ("anything", "r1", "car"),
-                ("anything", "r1", "car"),
-                ("speech", "r2", ""),
-                ("reversing beeper", "r3", ""),
-                ("street", "r4", ""),
-                ("pump", "r5", ""),
-                ("siren", "r1", ""),
-            ]
-        )
+    kinds = [
+        *(("tram", "r0", ""), ("anything", "r1", "car"), ("anything", "r1", "car"), ("speech", "r2", "")),
+        *(("reversing beeper", "r3", ""), ("street", "r4", ""), ("pump", "r5", ""), ("siren", "r1", "")),
     ]
-    path = table(tmp_path, rows)
+    path = table(tmp_path, [(pump(tmp_path / f"{n}.wav", n), *rest) for n, rest in enumerate(kinds)])
     learned = read_recorded(tmp_path, path)
-    kinds, hops = np.unique(learned.rows.kinds, return_counts=True)
-    assert dict(zip(kinds.tolist(), hops.tolist(), strict=True)) == dict.fromkeys(
-        ["beeper", CLOSE, "light", "pump", "siren", "tram", "voice"], HOPS_EACH
-    )
-    assert learned.recordings == {
-        "tram": 1,
-        "car": 1,
-        "speech": 1,
-        "reversing beeper": 1,
-        "street": 1,
-        "pump": 1,
-        "siren": 1,
-    }
+    simulated_kinds = ["beeper", CLOSE, "light", "pump", "siren", "tram", "voice"]
+    assert hops_of(learned.rows) == dict.fromkeys(simulated_kinds, HOPS_EACH)
+    names = ["tram", "car", "speech", "reversing beeper", "street", "pump", "siren"]
+    assert learned.recordings == dict.fromkeys(names, 1)
     assert "car 1, speech 1" in learned.told and learned.digest in learned.told
     assert "not the project's own" in learned.told
     path.write_text(path.read_text() + "\n")
     assert read_recorded(tmp_path, path).digest != learned.digest
-    nothing = np.zeros(0)
-    none = RoadUserRows(
-        np.zeros((0, learned.rows.measures.shape[1])),
-        nothing.astype(str),
-        nothing.astype(str),
-        nothing.astype(bool),
-        nothing.astype(bool),
-    )
-    vehicles = with_close(none, learned.rows)
+    nothing, no_hops = np.zeros(len(learned.rows.kinds), bool), np.zeros(0, bool)
+    none = learned.rows.select(nothing)
+    vehicles = with_close(RoadUserRows(none.measures, none.kinds, none.sites, no_hops, no_hops), learned.rows)
     assert set(vehicles.kinds.tolist()) == {"light", "tram"}
     assert set(of_guard(learned.rows).kinds.tolist()) == {CLOSE, "pump", "siren", "beeper", "voice"}
 
 
 def test_buses_of_free_recordings_count_as_trucks(tmp_path: Path) -> None:
-    path, free = tmp_path / "clips.csv", "Creative Commons 0"
+    free, header = "Creative Commons 0", ("file", "kind", "licence")
     rows = [(pump(tmp_path / f"{n}.wav", n), kind, free) for n, kind in enumerate(("bus", "bus", "tram"))]
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([("file", "kind", "licence"), *rows])
-    learned = read_recorded(tmp_path, path)
-    kinds, hops = np.unique(learned.rows.kinds, return_counts=True)
-    assert dict(zip(kinds.tolist(), hops.tolist(), strict=True)) == {
-        "heavy": 2 * HOPS_EACH,
-        "tram": HOPS_EACH,
-    }
+    learned = read_recorded(tmp_path, table(tmp_path, rows, header))
+    assert hops_of(learned.rows) == {"heavy": 2 * HOPS_EACH, "tram": HOPS_EACH}
     assert set(of_guard(learned.rows).kinds.tolist()) == {CLOSE}
-    assert (
-        learned.licences == (free,)
-        and f"3 recordings beside the simulation (bus 2, tram 1; {free}" in learned.told
-    )
+    assert learned.licences == (free,)
+    assert f"3 recordings beside the simulation (bus 2, tram 1; {free}" in learned.told
     # A model of CC0 recordings belongs to the project; one recording without a licence changes that.
     assert "not the project's own" not in learned.told
-    with path.open("a", newline="") as file:
-        csv.writer(file).writerow((pump(tmp_path / "3.wav", 3), "bus", ""))
-    told = read_recorded(tmp_path, path).told
+    rows.append((pump(tmp_path / "3.wav", 3), "bus", ""))
+    told = read_recorded(tmp_path, table(tmp_path, rows, header)).told
     assert "licence not stated" in told and "not the project's own" in told
 
 

@@ -109,6 +109,14 @@ def test_simultaneous_vehicles_form_one_approach() -> None:
         ("queue", (46.0, 48.5), (1, 1), False),
         ("single", (55.0,), (0,), True),
     ]
+    # A second vehicle belongs to its first, and to no other one.
+    pairs: list[Vehicle] = [
+        *(("both", "light", "left", 10.0), ("both", "light", "right", 15.9)),
+        *(("both", "light", "right", 16.5), ("both", "light", "left", 22.4)),
+        *(("queue", "light", "left", 40.0), ("follows", "light", "left", 46.2)),
+    ]
+    entries_s = [one.entries_s for one in approaches(heard(pairs))]
+    assert entries_s == [(10.0, 15.9), (16.5, 22.4), (40.0, 46.2)]
 
 
 KINDS = st.sampled_from(["light", "medium", "heavy", "electric", "bicycle", "scooter", "motorcycle"])
@@ -143,16 +151,6 @@ def test_an_array_has_real_figures_or_the_gap_of_another_array(
     assert known != gap != ()
     assert real_figures(shuffled, moving_ego=moving) == (gap if moving else known)
     assert real_figures(other, moving_ego=moving) == gap
-
-
-def test_a_second_vehicle_belongs_to_its_first() -> None:
-    pairs: list[Vehicle] = [
-        *(("both", "light", "left", 10.0), ("both", "light", "right", 15.9)),
-        *(("both", "light", "right", 16.5), ("both", "light", "left", 22.4)),
-        *(("queue", "light", "left", 40.0), ("follows", "light", "left", 46.2)),
-    ]
-    found = approaches(heard(pairs))
-    assert [one.entries_s for one in found] == [(10.0, 15.9), (16.5, 22.4), (40.0, 46.2)]
 
 
 def test_an_alarm_counts_within_the_horizon() -> None:
@@ -195,26 +193,18 @@ def test_figures_equal_counts_by_hand() -> None:
         *((33.0, 33.8, 0), (34.0, 34.6, 1)),  # both sides
         (51.0, 52.0, 0),  # no vehicle: the queue is missed, and the alarm comes after it
     ]
-    figures = examine(
-        [examined(heard(VEHICLES), spans), examined(heard([]), [(20.0, 20.5, 1), (40.0, 41.0, 0)])]
-    )
+    calm = examined(heard([]), [(20.0, 20.5, 1), (40.0, 41.0, 0)])
+    figures = examine([examined(heard(VEHICLES), spans), calm])
     assert (figures["approaches"], figures["detected"]) == (4, 0.75)
-    assert (figures["detected_single"], figures["detected_both"], figures["detected_queue"]) == (
-        1.0,
-        1.0,
-        0.0,
-    )
-    assert (figures["other_side_too"], figures["wrong_side_only"], figures["both_sides_found"]) == (
-        0.5,
-        0.5,
-        1.0,
-    )
+    assert [figures[f"detected_{flow}"] for flow in ("single", "both", "queue")] == [1.0, 1.0, 0.0]
+    sides = [figures[name] for name in ("other_side_too", "wrong_side_only", "both_sides_found")]
+    assert sides == [0.5, 0.5, 1.0]
     assert figures["onsets_after"] == 0.25
     hours = 590 * 0.1 / 3600.0
     assert figures["onsets_per_hour"] == pytest.approx(2.0 / hours)
     assert figures["lead_s"] == pytest.approx(np.mean([1.7, 2.9, 0.9]), abs=0.11)
-    assert (figures["approaches_light"], figures["detected_light"]) == (1, 1.0)
-    assert (figures["approaches_heavy"], figures["detected_heavy"]) == (1, 1.0)
+    for kind in ("light", "heavy"):
+        assert (figures[f"approaches_{kind}"], figures[f"detected_{kind}"]) == (1, 1.0)
     assert figures["lead_heavy_s"] == pytest.approx(2.9, abs=0.11)
     assert figures["lead_missed_as_0_s"] == pytest.approx(0.75 * float(figures["lead_s"] or 0.0))
 
@@ -239,9 +229,8 @@ def test_the_worst_junction_is_beside_the_mean() -> None:
     ]
     figures = examine([*good, *bad])
     assert (figures["detected"], figures["detected_worst_junction"]) == (0.75, 0.5)
-    assert figures["onsets_per_hour_worst_junction"] == pytest.approx(
-        2.0 * float(figures["onsets_per_hour"] or 0)
-    )
+    mean = float(figures["onsets_per_hour"] or 0)
+    assert figures["onsets_per_hour_worst_junction"] == pytest.approx(2.0 * mean)
     none = examine(good[:1])
     assert none["onsets_per_hour_worst_junction"] is None and none["detected_worst_junction"] == 1.0
 
@@ -403,14 +392,11 @@ def test_inconsistent_curves_raise_an_error() -> None:
             replace(good, **wrong)
 
 
-def test_two_quiet_junctions_give_a_threshold_without_alarms() -> None:
+def test_two_quiet_junctions_give_a_threshold_without_alarms_and_one_gives_none() -> None:
     quiet = levels(7, 2)
     curve, streams = measured_curve(quiet, elsewhere=True), [one for _, one in quiet]
     assert curve.onsets_per_hour.max() == 0.0
     assert counted(streams, curve.default(20.0).threshold_nats) == (0.0, 0.0)
-
-
-def test_one_junction_gives_no_threshold_for_others() -> None:
     with pytest.raises(InvalidArgumentError, match="at least 2 junctions, got 1"):
         measured_curve(levels(0, 1, 3), elsewhere=True)
 
@@ -477,14 +463,12 @@ def test_drives_of_a_moving_ego_all_differ() -> None:
     assert {one.site.name for one in exam} == {"DA1", "DA2", "DB1", "DB2", "DB3"} | others
     assert not any(one.ego.stands for one in (*learned, *exam))
     for streams in (learned, exam):
-        drives = Counter((one.site.renderer, one.traffic.name) for one in streams)
+        number = Counter((one.site.renderer, one.traffic.name) for one in streams)
         for traffic in ("approaches", "no-hazard"):
-            assert len({drives[renderer, traffic] for renderer in ("paths", "rays", "mirrors")}) == 1
-    minutes = {
-        traffic: sum(one.minutes for one in learned if one.traffic.name == traffic)
-        for traffic in ("approaches", "no-hazard")
-    }
-    assert minutes == {"approaches": pytest.approx(3 * 4.5), "no-hazard": pytest.approx(3 * 3.0)}
+            assert len({number[renderer, traffic] for renderer in ("paths", "rays", "mirrors")}) == 1
+    for traffic, minutes in (("approaches", 3 * 4.5), ("no-hazard", 3 * 3.0)):
+        drives = [one.minutes for one in learned if one.traffic.name == traffic]
+        assert sum(drives) == pytest.approx(minutes)
     # An approach and a hazard-free drive share a seed and have different traffic.
     assert len({one.seed for one in learned}) == 3 * 3 * 5
     assert not {one.seed for one in learned} & {one.seed for one in exam}

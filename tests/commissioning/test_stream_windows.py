@@ -33,11 +33,8 @@ def stream(*vehicles, site="SA1", rng=None):
     hops = HopTable({"time_s": TIME_S, "feature": features}, about={"site": site})
     names = ("vehicle", "flow", "kind", "arm", "entry_s", "hazard")
     told = [(i, arm, kind, arm, entry, True) for i, (kind, arm, entry) in enumerate(vehicles)]
-    rows = [
-        (i, t, 8.0, 1.0, entry <= t <= entry + 3.0)
-        for i, (_, _, entry) in enumerate(vehicles)
-        for t in TIME_S
-    ]
+    entries = enumerate(entry for _, _, entry in vehicles)
+    rows = [(i, t, 8.0, 1.0, entry <= t <= entry + 3.0) for i, entry in entries for t in TIME_S]
     seen = HopTable.of_rows(("vehicle", "time_s", "x_m", "y_m", "in_view"), rows)
     return HeardStream(hops, HopTable.of_rows(names, told), seen)
 
@@ -46,17 +43,24 @@ def label_at(labels, time_s):
     return labels[np.abs(TIME_S - time_s).argmin()]
 
 
-def test_windows_have_kind_arm_and_time_of_a_vehicle():
-    labels = hop_labels(stream(("light", "left", 20.0), ("light", "right", 40.0)))
-    times = {5.0: "none", 18.5: "", 19.5: "left", 20.0: "left", 20.2: "", 21.5: "front", 39.5: "right"}
-    assert {time: label_at(labels, time) for time in times} == times
-    # A second that ends after sight contains the vehicle, so no empty window follows at once.
-    assert label_at(labels, 23.5) == "" and label_at(labels, 24.2) == "none"
+# A second that ends after sight contains the vehicle, so no empty window follows at once.
+STANDING = {
+    5.0: "none",
+    18.5: "",
+    19.5: "left",
+    20.0: "left",
+    20.2: "",
+    21.5: "front",
+    23.5: "",
+    24.2: "none",
+}
+# Windows of a moving ego are half a second later.
+MOVING = {18.5: "", 19.5: "left", 20.5: "left", 20.7: "", 21.5: "front", 24.2: "none"}
 
 
-def test_windows_of_a_moving_ego_are_half_a_second_later():
-    labels = hop_labels(stream(("light", "left", 20.0), site="DA1"))
-    times = {18.5: "", 19.5: "left", 20.5: "left", 20.7: "", 21.5: "front", 24.2: "none"}
+@pytest.mark.parametrize(("site", "times"), [("SA1", STANDING), ("DA1", MOVING)])
+def test_windows_have_kind_arm_and_time_of_a_vehicle(site, times):
+    labels = hop_labels(stream(("light", "left", 20.0), ("light", "right", 40.0), site=site))
     assert {time: label_at(labels, time) for time in times} == times
 
 
@@ -107,20 +111,10 @@ def test_the_card_counts_the_classes_of_learned_streams(tmp_path):
     both.save(tmp_path / "heard.npz")
     n, names = 240, np.tile(["front", "left", "none", "right"], 60)
     keys, sites = np.arange(n).astype(str), np.tile(["SA1", "SB1"], n // 2)
-    write_features(
-        tmp_path / "real.csv",
-        FeatureTable(rng.uniform(0.05, 0.9, (n, 60)), names, keys, sites, keys, (None,) * n),
-    )
-    words = [
-        "model",
-        "fit",
-        tmp_path / "real.csv",
-        "--streams",
-        tmp_path / "heard.npz",
-        "--out",
-        tmp_path / "m",
-    ]
-    assert main([*map(str, words)]) == 0
+    table = FeatureTable(rng.uniform(0.05, 0.9, (n, 60)), names, keys, sites, keys, (None,) * n)
+    real, learned, out = (str(tmp_path / name) for name in ("real.csv", "heard.npz", "m"))
+    write_features(real, table)
+    assert main(["model", "fit", real, "--streams", learned, "--out", out]) == 0
     model = read_model(tmp_path / "m")
     assert model.signature.classes == WINDOW_CLASSES
     assert "180 direct" in model.provenance.classifier and " both" in model.provenance.classifier
@@ -129,9 +123,8 @@ def test_the_card_counts_the_classes_of_learned_streams(tmp_path):
     assert sum(model.policies.policies[0].reference_prior) == pytest.approx(1.0)
 
 
-RING = MicrophoneArray(
-    [[0.15 * np.cos(angle), 0.15 * np.sin(angle), 0.0] for angle in np.arange(8) * np.pi / 4]
-)
+ANGLES = np.arange(8) * np.pi / 4
+RING = MicrophoneArray(0.15 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(8)]))
 
 
 @pytest.mark.parametrize("azimuth_deg", [-60.0, 0.0, 45.0])
