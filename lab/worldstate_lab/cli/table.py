@@ -32,6 +32,7 @@ import argparse
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_array
@@ -41,7 +42,7 @@ from worldstate.cli.common.output import CommandResult, output_folder, write_rep
 from worldstate.cli.common.progress import progress_bar, track
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.simulation.dataset.dataset import write_dataset
+from worldstate.simulation.dataset.dataset import DatasetSettings, write_dataset
 from worldstate.simulation.scene.junction import MOVING_SITES, SITES
 from worldstate_lab.degradation.conditions import motion_detectors
 from worldstate_lab.degradation.degradation_study import DegradationSettings
@@ -54,10 +55,7 @@ from worldstate_lab.evaluation.evaluation import (
 )
 from worldstate_lab.evaluation.figures import FIGURES, titles
 from worldstate_lab.evaluation.report.contents import evaluation_document
-from worldstate_lab.evaluation.report.degradation_section import (
-    degradation_record,
-    sweep_tables,
-)
+from worldstate_lab.evaluation.report.degradation_section import degradation_record, sweep_tables
 from worldstate_lab.evaluation.report.warning_sections import equal_table
 from worldstate_lab.report.table import Cell, Table, Value, plain, write_document
 from worldstate_lab.trials import classification as windows
@@ -95,24 +93,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
-    _check(arguments)
+    if arguments.dataset is not None and arguments.smoke:
+        raise InvalidArgumentError("--smoke: expected no DATASET, because it simulates four recordings")
     output_folder(arguments.out, "evaluation.json")
-    takes = _takes(arguments)
+    if arguments.model is not None:
+        _check_model(arguments.model, arguments.dataset)
+    root = arguments.dataset or _simulated(arguments)
+    takes = find_takes(root, static_ids=arguments.static_ids, dynamic_ids=arguments.dynamic_ids)
     lacking_data(takes)
     classifiers = _classifiers(arguments, takes)
-    seeds = tuple(range(arguments.seed, arguments.seed + (FULL_SEEDS if arguments.full else 1)))
-    arguments.seeds = seeds
-    found = evaluate(
-        takes,
-        Hearer(arguments.out / "cache", arguments.model),
-        classifiers,
-        arguments.jobs,
-        track,
-        EvaluationSettings(
-            seeds,
-            degradation=_degradation(arguments, classifiers, takes),
-        ),
-    )
+    arguments.seeds = tuple(range(arguments.seed, arguments.seed + (FULL_SEEDS if arguments.full else 1)))
+    settings = EvaluationSettings(arguments.seeds, degradation=_degradation(arguments, classifiers, takes))
+    hearing = Hearer(arguments.out / "cache", arguments.model)
+    found = evaluate(takes, hearing, classifiers, arguments.jobs, track, settings)
     report = _report(found)
     write_report(arguments.out / "evaluation.json", report)
     write_document(evaluation_document(found, _configuration(arguments)), arguments.out)
@@ -147,34 +140,16 @@ def _is_foreign(take: Take) -> bool:
         return False
 
 
-def _check(arguments: argparse.Namespace) -> None:
-
-    if arguments.dataset is not None and arguments.smoke:
-        raise InvalidArgumentError("--smoke: expected no DATASET, because it simulates four recordings")
-
-
 def _configuration(arguments: argparse.Namespace) -> list[tuple[str, str]]:
     """Return the options that figures may depend on, given or by default."""
-    names = [name for name in vars(arguments) if name not in _NO_FIGURE]
-    return [(f"--{name.replace('_', '-')}", _told(getattr(arguments, name))) for name in names]
-
-
-def _told(value: object) -> str:
-    if isinstance(value, list):
-        return " ".join(map(_told, value)) or "none"
-    return "none" if value is None else value.name if isinstance(value, Path) else str(value)
-
-
-def _takes(arguments: argparse.Namespace) -> TakeList:
-
-    if arguments.model is not None:
-        _check_model(arguments.model, arguments.dataset)
-    root = arguments.dataset or _simulated(arguments)
-    return find_takes(
-        root,
-        static_ids=arguments.static_ids,
-        dynamic_ids=arguments.dynamic_ids,
-    )
+    given = {name: one for name, one in vars(arguments).items() if name not in _NO_FIGURE}
+    return [
+        (
+            f"--{name.replace('_', '-')}",
+            "none" if one is None else one.name if isinstance(one, Path) else str(one),
+        )
+        for name, one in given.items()
+    ]
 
 
 def _check_model(model: Path, dataset: Path | None) -> None:
@@ -187,8 +162,6 @@ def _check_model(model: Path, dataset: Path | None) -> None:
 
 def _simulated(arguments: argparse.Namespace) -> Path:
     """Simulate the streets that are missing or have other settings."""
-    from worldstate.simulation.dataset.dataset import DatasetSettings
-
     root: Path = arguments.out / ("smoke" if arguments.smoke else "streets")
     static, dynamic, length_s = (SMOKE_STATIC, 0, SMOKE_S) if arguments.smoke else (STATIC, DYNAMIC, 10.0)
     # A moving ego has no video, because its camera moves, and every box with it.
@@ -203,7 +176,6 @@ def _simulated(arguments: argparse.Namespace) -> Path:
 
 
 def _classifiers(arguments: argparse.Namespace, takes: TakeList) -> Classifiers:
-
     folder = arguments.out / "cache"
     folder.mkdir(parents=True, exist_ok=True)
     if arguments.features is not None:
@@ -215,55 +187,43 @@ def _classifiers(arguments: argparse.Namespace, takes: TakeList) -> Classifiers:
         count = SMOKE_WINDOWS if arguments.smoke else windows.PER_APPROACH
         sites = sorted({take.site for take in (*takes.static, *takes.dynamic)} & {*SITES, *MOVING_SITES})
         with progress_bar("simulating windows", 4 * count * len(sites)) as bar:
-            found = windows.windows_from_simulation(
-                folder,
-                arguments.seed,
-                per_approach=count,
-                sites=sites,
-                jobs=arguments.jobs,
-                progress=bar.advance,
-            )
+            options = {"per_approach": count, "jobs": arguments.jobs, "progress": bar.advance}
+            found = windows.windows_from_simulation(folder, arguments.seed, sites=sites, **options)
     return Classifiers(*(found or (None, "the calibration recordings of each fold")))
 
 
-def _report(found: Evaluation) -> dict[str, object]:
-
-    report: dict[str, object] = plain(
-        {
-            "data": found.takes.origin,
-            "recordings": len(found.trials),
-            "failed": {one.name: one.problem for one in found.failed},
-            "stands_on": {name: run.stands_on for name, run in found.runs.items()},
-            "refused": {name: refused for name, refused in found.refused.items() if refused},
-            "lacking": found.lacking,
-            "cautions": {name: run.cautions for name, run in found.runs.items()},
-            "protocols": {
-                name: {
-                    method: score.figures() | {"false_alarms_upper_90": score.poisson_upper()}
-                    for method, score in scores.items()
-                }
-                for name, scores in found.scores.items()
-            },
-            "equal_detection": found.equal,
-            "degradation": None if found.degradation is None else degradation_record(found.degradation),
-            "front_end": None
-            if (study := found.front_end) is None
-            else {**study.figures, "bearing_srp_by_junction": study.by_site},
-        }
-    )
-    return report
+def _report(found: Evaluation) -> dict[str, Any]:
+    study = found.front_end
+    report = {
+        "data": found.takes.origin,
+        "recordings": len(found.trials),
+        "failed": {one.name: one.problem for one in found.failed},
+        "stands_on": {name: run.stands_on for name, run in found.runs.items()},
+        "refused": {name: refused for name, refused in found.refused.items() if refused},
+        "lacking": found.lacking,
+        "cautions": {name: run.cautions for name, run in found.runs.items()},
+        "protocols": {
+            name: {
+                method: score.figures() | {"false_alarms_upper_90": score.poisson_upper()}
+                for method, score in scores.items()
+            }
+            for name, scores in found.scores.items()
+        },
+        "equal_detection": found.equal,
+        "degradation": None if found.degradation is None else degradation_record(found.degradation),
+        "front_end": None if study is None else {**study.figures, "bearing_srp_by_junction": study.by_site},
+    }
+    return dict(plain(report))
 
 
 def _lines(found: Evaluation) -> list[str]:
-
     lines = [f"not processed: {one.name}: {one.problem}" for one in found.failed]
     lines += [f"not run: {name} {what}" for name, what in found.lacking.items()]
-    tables = [] if found.degradation is None else sweep_tables(found.degradation)
     for name, run in found.runs.items():
-        refused = found.refused.get(name, {})
         lines += ["", *_warnings(found, name).lines(), *run.cautions]
-        lines += [f"not scored: {method}: {why}" for method, why in refused.items()]
+        lines += [f"not scored: {method}: {why}" for method, why in found.refused.get(name, {}).items()]
         lines += equal_table(found, name).lines() if found.equal.get(name) else []
+    tables = [] if found.degradation is None else sweep_tables(found.degradation)
     return [*lines, *(line for table in tables for line in ("", *table.lines()))]
 
 

@@ -1,12 +1,10 @@
 """The complete evaluation: front-end on all recordings once, then every protocol, then all scores."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
-from typing import Protocol as Interface
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -21,36 +19,18 @@ from worldstate_lab.degradation.degradation_study import (
     Tables,
     degradation_study,
 )
-from worldstate_lab.evaluation.protocols import methods_for, refused_methods
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
 from worldstate_lab.trials.classification import Classifiers
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.pass_cache import (
-    Failed,
-    Hearer,
-    PassCache,
-    attempted,
-    fingerprint,
-    hear,
-)
+from worldstate_lab.trials.pass_cache import Failed, Hearer, PassCache, attempted, fingerprint, hear
 from worldstate_lab.trials.trial import TakeList, Trial
 
 from .front_end_study import FrontEndStudy, front_end_study
-from .protocols import PROTOCOLS, ProtocolRun, run_protocol
+from .protocols import PROTOCOLS, ProtocolRun, methods_for, refused_methods, run_protocol
 from .scores import EqualDetection, Score, equal_detection
 
-Item = TypeVar("Item")
-
-# The paper's alpha.
-ALPHA = 0.02
-
-
-class Progress(Interface):
-    """Reports progress while it yields the items of a step; their number is known."""
-
-    def __call__(self, items: Iterable[Item], description: str, total: int, /) -> Iterator[Item]:
-        """Yield the items."""
-        ...
+# Yields the items of a step, of which there are so many, and reports progress.
+Progress = Callable[[Iterable[Any], str, int], Iterator[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +97,13 @@ def evaluate(
         one.name: run_protocol(one, some, methods_for(some), classifiers, settings.seeds)
         for one, some in track(own.items(), "fitting and deciding", len(own))
     }
-    scores = {name: _scored(run, track) for name, run in runs.items()}
+    scores = {
+        name: {
+            method: Score.of(run.trials, passes)
+            for method, passes in track(run.decisions.items(), "scoring", len(run.decisions))
+        }
+        for name, run in runs.items()
+    }
     rng = np.random.default_rng(settings.seeds[0])
     drawn = {
         name: stratified_draws([(t.label, t.site) for t in run.trials], rng, settings.draws)
@@ -126,34 +112,21 @@ def evaluate(
     standing = [trial for trial in trials if not trial.hops.about["moving"]]
     filmed = any(np.isfinite(trial.hops.reference_rad).any() for trial in standing)
     front_end = front_end_study(standing, rng, settings.draws) if filmed else None
-    found = Evaluation(
-        takes, tuple(trials), tuple(failed), lacking, runs, scores, drawn, front_end, None, settings,
-        {one.name: refused_methods(some) for one, some in own.items()},
-        {
-            name: equal_detection(run.trials, run.decisions, drawn[name])
-            for name, run in runs.items()
-            if not run.protocol.by_junction
-        },
-    )  # fmt: skip
+    equal = {
+        name: equal_detection(run.trials, run.decisions, drawn[name])
+        for name, run in runs.items()
+        if not run.protocol.by_junction
+    }
+    sweep = None
     # Broken videos may leave too few recordings for a sweep; the other figures are kept in that case.
     if settings.degradation is not None:
-        with _noted(lacking, "degradation sweep"):
-            found = replace(found, degradation=_degradation(left, hearing, jobs, track, settings.degradation))
-    return found
-
-
-def _scored(run: ProtocolRun, track: Progress) -> dict[str, Score]:
-    every = track(run.decisions.items(), "scoring", len(run.decisions))
-    return {method: Score.of(run.trials, passes) for method, passes in every}
-
-
-@contextmanager
-def _noted(lacking: dict[str, str], name: str) -> Iterator[None]:
-    """Catch an error for missing data in a part of the evaluation, and store its message."""
-    try:
-        yield
-    except InvalidArgumentError as error:
-        lacking[name] = str(error)
+        try:
+            sweep = _degradation(left, hearing, jobs, track, settings.degradation)
+        except InvalidArgumentError as error:
+            lacking["degradation sweep"] = str(error)
+    refused = {one.name: refused_methods(some) for one, some in own.items()}
+    of = takes, tuple(trials), tuple(failed), lacking
+    return Evaluation(*of, runs, scores, drawn, front_end, sweep, settings, refused, equal)
 
 
 def _left(takes: TakeList, trials: Sequence[Trial]) -> TakeList:

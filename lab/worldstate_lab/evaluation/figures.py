@@ -33,23 +33,18 @@ class FigureKind:
     counts: tuple[str, str]
     unit: float
 
-    @property
-    def words(self) -> str:
-        """The title without its unit."""
-        return self.title.partition(" (")[0]
-
 
 def _rows(name: str) -> list[dict[str, Any]]:
     text = files(__package__).joinpath(name).read_text(encoding="utf-8")
     return list(csv.DictReader(text.splitlines()))
 
 
-def _kind(row: dict[str, Any]) -> FigureKind:
-    counts = row["above"], row["below"]
-    return FigureKind(row["title"], int(row["digits"]), row["worse"], counts, _UNITS[row["unit"]])
-
-
-FIGURES = {row["figure"]: _kind(row) for row in _rows("figures.csv")}
+FIGURES = {
+    row["figure"]: FigureKind(
+        row["title"], int(row["digits"]), row["worse"], (row["above"], row["below"]), _UNITS[row["unit"]]
+    )
+    for row in _rows("figures.csv")
+}
 
 
 def titles(figures: Iterable[str]) -> tuple[str, ...]:
@@ -91,12 +86,10 @@ class PaperValue:
         return max(stated, 2) if stated and self.unit in ("share", "") else stated
 
 
-def _stated(row: dict[str, Any]) -> PaperValue:
-    numbers = {name: float(row[name] or math.nan) for name in ("value", "low", "high")}
-    return PaperValue(**(row | numbers))
-
-
-PAPER_VALUES = tuple(map(_stated, _rows("paper_values.csv")))
+PAPER_VALUES = tuple(
+    PaperValue(**(row | {name: float(row[name] or math.nan) for name in ("value", "low", "high")}))
+    for row in _rows("paper_values.csv")
+)
 _BY_NAME = {(one.group, one.row, one.figure): one for one in PAPER_VALUES}
 
 

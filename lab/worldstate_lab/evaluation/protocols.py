@@ -1,6 +1,5 @@
 """Split of recordings into calibration and test, and every method fitted and applied on each split."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -32,17 +31,12 @@ class Protocol:
     def lacks(self, takes: Sequence[Take]) -> str | None:
         """Return what is missing for this protocol, or None, without processing a recording."""
         chosen = [take for take in takes if take.moving == self.moving]
-        counts = Counter("none" if take.hazard_free else "approach" for take in chosen)
-        least = {"approach": 2, "none": 2}
-        wanted = [
-            f"{least[kind]} {name}, found {counts[kind]}"
-            for kind, name in (("approach", "approaches with a T0"), ("none", "hazard-free recordings"))
-            if counts[kind] < least[kind]
-        ]
-        if self.by_junction:
-            both = junctions_with_both([(take.site, take.hazard_free) for take in chosen])
-            if len(both) < 2:
-                wanted.append(f"2 junctions with approaches and hazard-free recordings, found {len(both)}")
+        calm = sum(take.hazard_free for take in chosen)
+        kinds = {"approaches with a T0": len(chosen) - calm, "hazard-free recordings": calm}
+        wanted = [f"2 {name}, found {count}" for name, count in kinds.items() if count < 2]
+        both = junctions_with_both([(take.site, take.hazard_free) for take in chosen])
+        if self.by_junction and len(both) < 2:
+            wanted.append(f"2 junctions with approaches and hazard-free recordings, found {len(both)}")
         ego = "moving" if self.moving else "standing"
         return f"needs, with a {ego} ego, " + " and ".join(wanted) if wanted else None
 
@@ -50,8 +44,13 @@ class Protocol:
         self, trials: Sequence[Trial], rng: np.random.Generator
     ) -> Iterator[tuple[list[int], list[int]]]:
         """Yield rows of calibration and test recordings; every recording is a test recording once."""
-        labels, sites = [trial.label for trial in trials], [trial.site for trial in trials]
-        fold_of = self._by_junction(trials) if self.by_junction else deal_folds(labels, sites, rng, FOLDS)
+        sites = [trial.site for trial in trials]
+        if self.by_junction:
+            names = junctions_with_both([(trial.site, trial.hazard_free) for trial in trials])
+            # -1 if one kind of recordings is missing at the junction.
+            fold_of = np.array([names.index(j) if (j := junction_of(one)) in names else -1 for one in sites])
+        else:
+            fold_of = deal_folds([trial.label for trial in trials], sites, rng, FOLDS)
         for fold in np.unique(fold_of[fold_of >= 0]).tolist():
             calibration = np.flatnonzero(fold_of != fold).tolist()
             tested = np.flatnonzero(fold_of == fold).tolist()
@@ -59,11 +58,6 @@ class Protocol:
             if shared:
                 raise InvalidArgumentError(f"recordings: {sorted(shared)[0]} both calibrates and is tested")
             yield calibration, tested
-
-    def _by_junction(self, trials: Sequence[Trial]) -> np.ndarray:
-        """Return the number of each trial's junction; -1 if one kind of recordings is missing there."""
-        names = junctions_with_both([(trial.site, trial.hazard_free) for trial in trials])
-        return np.array([names.index(j) if (j := junction_of(t.site)) in names else -1 for t in trials])
 
 
 STATIC = Protocol("static", "Standing ego, five folds")
@@ -147,10 +141,7 @@ def run_protocol(
                 said[method.name] |= {i: decide(trial) for i, trial in zip(tested, after, strict=True)}
         passes.append(said)
     rows = sorted(next(iter(passes[0].values())))
-    decisions = {
-        name: tuple(tuple(one[name][i] for i in rows) for one in passes)
-        for name in (method.name for method in methods)
-    }
+    decisions = {name: tuple(tuple(one[name][i] for i in rows) for one in passes) for name in passes[0]}
     trained_on = classifiers.trained_on(protocol.trained_on) if classifiers else ""
     return ProtocolRun(protocol, tuple(trials[i] for i in rows), decisions, used, trained_on)
 
@@ -196,13 +187,9 @@ def methods_for(trials: Sequence[Trial]) -> tuple[Method, ...]:
 def refused_methods(trials: Sequence[Trial]) -> dict[str, str]:
     """Return, by method that is not scored, why its model does not fit the sound of a recording."""
     refused = {key: why for trial in trials for key, why in trial.refused.items()}
-    return {
-        method.name: refused[said_by]
-        for method in (*METHODS, *GROUNDED)
-        if (said_by := _said_by(method)) in refused
+    # The chain or the scores that a method uses.
+    used = {
+        one.name: one.chain if isinstance(one, ShippedChain) else str(getattr(one, "evidence", ""))
+        for one in (*METHODS, *GROUNDED)
     }
-
-
-def _said_by(method: Method) -> str:
-    """Return the name of the chain or of the scores that a method uses."""
-    return method.chain if isinstance(method, ShippedChain) else str(getattr(method, "evidence", ""))
+    return {name: refused[source] for name, source in used.items() if source in refused}

@@ -38,8 +38,9 @@ def _label(one: PaperValue) -> str:
     """Return condition and figure as a label."""
     if one.group in _NAMED_BY_ROW:
         return one.row
-    words = FIGURES[one.figure].words if one.figure in FIGURES else one.figure.replace("_", " ")
-    return f"{one.row}: {words}"
+    # Without the unit.
+    title = FIGURES[one.figure].title if one.figure in FIGURES else one.figure.replace("_", " ")
+    return f"{one.row}: {title.partition(' (')[0]}"
 
 
 def _ours(one: PaperValue, measured: MeasuredValues) -> Value:
