@@ -31,7 +31,16 @@ from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
 from worldstate_lab.methods.line_of_sight import VisionOnly
 from worldstate_lab.metrics.intervals import stratified_draws
-from worldstate_lab.report.table import Document, Figure, Section, Table, Value, markdown_page, write_document
+from worldstate_lab.report.table import (
+    Document,
+    Figure,
+    Section,
+    Table,
+    Value,
+    csv_text,
+    markdown_page,
+    write_document,
+)
 from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
 
 from worldstate.ground.errors import InputFileError
@@ -64,7 +73,7 @@ def test_external_text_is_never_markup():
 @given(st.lists(st.tuples(st.text(max_size=8), st.floats(-1e6, 1e6)), min_size=1, max_size=5))
 def test_csv_preserves_every_number_to_the_last_bit(rows):
     table = Table("t", "", ("name", "x"), tuple((name, Value(x, x - 1.0)) for name, x in rows))
-    read = list(csv.reader(io.StringIO(table.csv(), newline="")))
+    read = list(csv.reader(io.StringIO(csv_text(table.columns, table.rows), newline="")))
     assert read[0] == ["name", "x value", "x low"]
     assert [(float(a), float(b)) for _, a, b in read[1:]] == [(x, x - 1.0) for _, x in rows]
 
@@ -234,7 +243,7 @@ def test_every_table_states_its_data_and_every_mean_its_worst_junction(evaluatio
     rate = dict(zip(table.columns, row, strict=True))["false alarms (1/h)"]
     worst = max(sites, key=lambda site: sites[site]["false_alarms_per_hour"])
     assert rate.note == f"worst {worst} {sites[worst]['false_alarms_per_hour']:.0f}"
-    assert rate.note in table.csv()
+    assert rate.note in csv_text(table.columns, table.rows)
     fewer = next(row for row in blocks["paper"].rows if row[2].endswith("false alarms saved"))[5]
     assert fewer.low <= fewer.value <= fewer.high
 

@@ -22,7 +22,7 @@ import argparse
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -146,13 +146,11 @@ _NAME = re.compile(r"(Site[12])_([LR])_(\d+)_Trial\d+")
 
 
 # Figures of one pass, and their column heads; errors are None if no position is known.
-_COUNTS = {
+_COLUMNS = {
     "hops": "hops",
     "hidden_hops": "hidden",
     "side_right": "side",  # Hidden hops in which the likelier side is correct
     "stated": "stated",  # Share of hops with a stated position
-}
-_ERRORS = {
     "rmse_m": "error",
     "hidden_rmse_m": "hidden",
     "coverage": "in 90 %",
@@ -161,23 +159,13 @@ _ERRORS = {
     "constant_rmse_m": "const.",
     "constant_hidden_rmse_m": "hidden",
 }
-_COLUMNS = _COUNTS | _ERRORS
 PlaceFigures = dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceExam:
-    """Real trials, simulated passes, and the cost of a hop."""
-
-    trials: tuple[PlaceFigures, ...]
-    passes: tuple[PlaceFigures, ...]
-    ms_a_hop: float
 
 
 def place_exam(
     trials: Sequence[Path], passes: int, seed: int, on_pass: Callable[[], None] = lambda: None
-) -> PlaceExam:
-    """Score positions on recorded trials, and on passes simulated at the same junctions.
+) -> dict[str, Any]:
+    """Score positions on recorded trials and on passes simulated at the same junctions; cost of a hop.
 
     The method uses the junction in the name of a trial; its side and speed are used for scoring only.
     """
@@ -186,18 +174,26 @@ def place_exam(
         name: PlaceFilter(RayModel.of(walls, AZIMUTHS_RAD, ours[name].model.along_m))
         for name, walls in WALLS.items()
     }
-    found, spent_s, hops = [], 0.0, 0
+    found, spent_s, hops = list[PlaceFigures](), 0.0, 0
     for name, site, table, right in _recordings(trials, passes, seed):
         began = time.process_time()
         said = followed_places(ours[site], table)
         spent_s, hops = spent_s + time.process_time() - began, hops + len(said)
-        figures = _figures(name, said, right)
+        left = np.array([one.left_probability for one in said])
+        hidden, as_said = right != 0.0, np.where(left > 0.5, 1.0, -1.0) == right
+        figures = dict.fromkeys(_COLUMNS) | {
+            "name": name,
+            "hops": len(said),
+            "hidden_hops": int(hidden.sum()),
+            "side_right": int(as_said[hidden].sum()),
+            "stated": float(np.mean([one.stated for one in said])),
+        }
         if np.isfinite(table.along_m).any():
-            beside = followed_places(plain[site], table)
-            figures |= _errors(table.along_m, said, beside, WALLS[site])
+            figures |= _errors(table.along_m, said, followed_places(plain[site], table), WALLS[site])
         found.append(figures)
         on_pass()
-    return PlaceExam(tuple(found[: len(trials)]), tuple(found[len(trials) :]), 1e3 * spent_s / max(hops, 1))
+    of = {"trials": found[: len(trials)], "passes": found[len(trials) :]}
+    return {**of, "ms_a_hop": 1e3 * spent_s / max(hops, 1)}
 
 
 def _recordings(
@@ -256,15 +252,6 @@ def _likely_sides(table: SpectrumTable, side: str, speed_mps: float, walls: Stre
     return np.asarray(np.where(table.time_s < crossed_s, first, -first) * hidden)
 
 
-def _figures(name: str, said: Sequence[PlaceEstimate], right: FloatArray) -> PlaceFigures:
-    left = np.array([one.left_probability for one in said])
-    hidden = right != 0.0
-    stated = float(np.mean([one.stated for one in said]))
-    as_said = np.where(left > 0.5, 1.0, -1.0) == right
-    counts = {"hidden_hops": int(hidden.sum()), "side_right": int(as_said[hidden].sum())}
-    return {"name": name, "hops": len(said), **counts, "stated": stated, **dict.fromkeys(_ERRORS)}
-
-
 def _errors(
     along_m: FloatArray, said: Sequence[PlaceEstimate], beside: Sequence[PlaceEstimate], walls: StreetWalls
 ) -> PlaceFigures:
@@ -300,21 +287,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
     with progress_bar("following", len(arguments.trials) + arguments.passes) as bar:
-        exam = place_exam(arguments.trials, arguments.passes, arguments.seed, bar.advance)
-    rows: list[tuple[str, ...]] = []
-    report = asdict(exam)
-    for title, figures in (("trials", exam.trials), ("simulated", exam.passes)):
-        if title == "trials":
-            rows += [_row(one["name"], one) for one in figures]
+        report = place_exam(arguments.trials, arguments.passes, arguments.seed, bar.advance)
+    rows = [_row(one["name"], one) for one in report["trials"]]
+    for title, figures in (("trials", report["trials"]), ("simulated", report["passes"])):
         scored = [one for one in figures if one["rmse_m"] is not None]
         if scored:
             means = {name: sum(one[name] for one in scored) / len(scored) for name in _COLUMNS}
             report[f"mean_of_{title}"] = means | {"worst_rmse_m": max(one["rmse_m"] for one in scored)}
             rows.append(_row(f"{title}, mean of {len(scored)}", means))
-    table = Table("places", f"{exam.ms_a_hop:.2f} ms per hop", ("pass", *_COLUMNS.values()), rows)
+    table = Table("places", f"{report['ms_a_hop']:.2f} ms per hop", ("pass", *_COLUMNS.values()), rows)
     return CommandResult(report, table={}, lines=table.lines())
 
 
-def _row(name: str, found: dict[str, float | None]) -> tuple[str, ...]:
+def _row(name: str, found: PlaceFigures) -> tuple[str, ...]:
     values = (found[column] for column in _COLUMNS)
     return name, *("-" if one is None else format(one, ".3g") for one in values)

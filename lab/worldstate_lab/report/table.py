@@ -1,7 +1,7 @@
 """The table type of all studies: printed, written as JSON and CSV, and inserted into pages.
 
 A study returns its findings as `Table` values, and its pictures as `Figure` values. A command prints
-``table.lines()``, includes ``plain(findings)`` in its JSON report and writes ``table.csv()``. A `Document`
+``table.lines()`` and includes ``plain(findings)`` in its JSON report. A `Document`
 combines tables and figures in `report.md`, a Markdown page with its figures and numbers as files; all files
 are written, or none.
 """
@@ -11,9 +11,8 @@ import io
 import math
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -120,10 +119,6 @@ class Table:
         widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
         return [self.title, *(_aligned(row, widths) for row in texts)]
 
-    def csv(self) -> str:
-        """Return the numbers with full precision."""
-        return csv_text(self.columns, self.rows)
-
 
 @dataclass(frozen=True, slots=True)
 class Figure:
@@ -136,10 +131,6 @@ class Figure:
     columns: tuple[str, ...]
     rows: Sequence[Sequence[Cell]]
     size_in: tuple[float, float] = (4.4, 3.7)
-
-    def csv(self) -> str:
-        """Return the numbers with full precision."""
-        return csv_text(self.columns, self.rows)
 
 
 Block: TypeAlias = Table | Figure
@@ -155,7 +146,7 @@ def csv_text(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
     ours,1.7,1.3,1.69
     <BLANKLINE>
     """
-    split = chain.from_iterable(_split(title, [row[i] for row in rows]) for i, title in enumerate(columns))
+    split = [part for i, title in enumerate(columns) for part in _split(title, [row[i] for row in rows])]
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows(zip(*split, strict=True))
     return buffer.getvalue()
@@ -213,11 +204,8 @@ def plain(value: Any) -> Any:
 
 def _aligned(row: Sequence[str], widths: Sequence[int]) -> str:
     """Return a line with the first column left-aligned and the numbers right-aligned."""
-    cells = [
-        row[0].ljust(widths[0]),
-        *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
-    ]
-    return "  ".join(cells).rstrip()
+    numbers = (cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))
+    return "  ".join([row[0].ljust(widths[0]), *numbers]).rstrip()
 
 
 def _split(title: str, cells: Sequence[Cell]) -> Iterable[list[float | str]]:
@@ -248,18 +236,11 @@ def _written(cell: Cell) -> float | str:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading with paragraphs, tables and figures, and subsections."""
+    """A heading with paragraphs, tables and figures."""
 
     title: str
     text: tuple[str, ...] = ()
     blocks: tuple[Block, ...] = ()
-    subsections: "tuple[Section, ...]" = ()
-
-    def walk(self, level: int) -> "Iterator[tuple[int, Section]]":
-        """Yield this section and its subsections in reading order, each with its level."""
-        yield level, self
-        for one in self.subsections:
-            yield from one.walk(level + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,15 +252,10 @@ class Document:
     sections: tuple[Section, ...]
     facts: tuple[tuple[str, str], ...] = ()
 
-    def walk(self) -> Iterator[tuple[int, Section]]:
-        """Yield every section in reading order, with the level of its heading."""
-        for section in self.sections:
-            yield from section.walk(2)
-
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Every table and figure, in reading order."""
-        return tuple(block for _, section in self.walk() for block in section.blocks)
+        return tuple(block for section in self.sections for block in section.blocks)
 
 
 def markdown_page(document: Document, files: str) -> str:
@@ -303,8 +279,8 @@ def markdown_page(document: Document, files: str) -> str:
     <BLANKLINE>
     """
     parts = [f"# {_escaped(document.title)}", f"**{_escaped(document.lead)}**"]
-    for level, section in document.walk():
-        parts += [f"{'#' * level} {_escaped(section.title)}", *map(_escaped, section.text)]
+    for section in document.sections:
+        parts += [f"## {_escaped(section.title)}", *map(_escaped, section.text)]
         parts += [part for block in section.blocks for part in _markdown_block(block, files)]
     parts += ["## Versions and settings", _markdown_rows(("", ""), document.facts)]
     return "\n\n".join(parts) + "\n"
@@ -365,7 +341,7 @@ def _write_all(document: Document, folder: Path) -> None:
     files = folder / FILES
     files.mkdir()
     for block in document.blocks:
-        _write(files / f"{block.name}.csv", block.csv())
+        _write(files / f"{block.name}.csv", csv_text(block.columns, block.rows))
         if isinstance(block, Figure):
             with figure_file(files / f"{block.name}.png", *block.size_in) as canvas:
                 block.draw(canvas)

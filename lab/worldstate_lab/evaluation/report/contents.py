@@ -69,14 +69,13 @@ def front_end_section(measured: MeasuredValues) -> Section:
 
 def transfer_section(measured: MeasuredValues) -> Section:
     """Return the section on protocols other than the static folds, with every junction of all protocols."""
-    parts = []
+    tables = []
     for name, run in measured.found.runs.items():
         if name != STANDING:
             told = f"Published classifier trained on: {run.trained_on}. Intervals as in Table I."
-            methods, title = measured.methods(name), run.protocol.title
-            table = measured.table(name, methods, _TRANSFER, f"protocol_{name}", title, told)
-            parts.append(Section(title, (), (table,)))
-    return Section("Generalisation", (), (_junction_table(measured.found),), tuple(parts))
+            of = f"protocol_{name}", run.protocol.title, told
+            tables.append(measured.table(name, measured.methods(name), _TRANSFER, *of))
+    return Section("Generalisation", (), (*tables, _junction_table(measured.found)))
 
 
 def _junction_table(found: Evaluation) -> Table:
