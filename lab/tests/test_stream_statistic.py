@@ -5,7 +5,7 @@ import pytest
 from hop_tables import blank_stream
 from hypothesis import given
 from hypothesis import strategies as st
-from worldstate_lab.metrics.stream_statistic import StatisticSwitches, stream_statistic
+from worldstate_lab.metrics.stream_statistic import stream_statistic
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.evidence import SignatureEvidence, statistic
@@ -35,14 +35,12 @@ def test_over_a_stream_the_statistic_is_that_of_every_hop(rows):
     expected = [statistic(m.signature, m.co_evidence, PRIOR) for m in measured]
     assert stream_statistic(stream, PRIOR) == pytest.approx(expected, rel=1e-9)
     alone = [statistic(m.signature, Unqueried("-"), PRIOR) for m in measured]
-    switched = stream_statistic(stream, PRIOR, StatisticSwitches(use_absence=False))
+    switched = stream_statistic(stream, PRIOR, use_absence=False)
     assert switched == pytest.approx(alone, rel=1e-9)
 
 
 def test_the_approach_term_shifts_the_log_odds_by_its_weight_and_only_if_usable():
     stream = blank_stream("x", 4).replace(approach=np.array([np.nan, 0.0, 1.5, -9.0]))
-    plain, looming = (
-        stream_statistic(stream, PRIOR, StatisticSwitches(approach_weight=w)) for w in (0.0, 0.4)
-    )
+    plain, looming = (stream_statistic(stream, PRIOR, approach_weight=w) for w in (0.0, 0.4))
     shift = np.log(looming / (1 - looming)) - np.log(plain / (1 - plain))
     assert shift == pytest.approx([0.0, 0.0, 0.6, -1.2], abs=1e-9)

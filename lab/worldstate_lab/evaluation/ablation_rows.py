@@ -1,6 +1,6 @@
 """Ablations of the paper's statistic: one part changed at a time, on the same folds of recordings."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +12,6 @@ from worldstate.abduction.cueing.risk_map import (
     fit_isotonic,
 )
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
-from worldstate.ground.checks import in_range
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.approach_table import (
     ApproachTable,
@@ -25,11 +23,7 @@ from worldstate.operations.metrics.approach_table import (
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.methods.acoustic_rules import LOOMING_WEIGHTS, best_weight, labelled_windows
 from worldstate_lab.metrics.intervals import calibration_error_sampling, deal_folds
-from worldstate_lab.metrics.stream_statistic import (
-    StatisticSwitches,
-    log_joint,
-    stream_statistic,
-)
+from worldstate_lab.metrics.stream_statistic import log_joint, stream_statistic
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +41,6 @@ class AblationSwitches:
         ``(0.0,)`` leaves looming out.
     alpha, sustain_hops : float, int
         Budget and number of hops of the sustained rule.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range.
-
-    Examples
-    --------
-    >>> AblationSwitches(use_absence=False).approach_weights
-    (0.0,)
     """
 
     use_absence: bool = True
@@ -65,53 +49,17 @@ class AblationSwitches:
     alpha: float = 0.02
     sustain_hops: int = 3
 
-    def __post_init__(self) -> None:
-        if not self.approach_weights:
-            raise InvalidArgumentError("approach_weights: expected at least one")
-        in_range("alpha", self.alpha, 0.0, 1.0, open_high=True)
 
-    def statistic_with(self, weight: float) -> StatisticSwitches:
-        """Return the switches of the statistic at one weight of looming."""
-        return StatisticSwitches(use_absence=self.use_absence, approach_weight=weight)
-
-
-@dataclass(frozen=True, slots=True)
-class AblationRow:
-    """One row of the table; a value is None if the streams contain no data for it."""
-
-    auroc: float | None  # AUROC of windows before T0 against hazard-free windows
-    detected: float | None  # Share of approaches announced before T0, and their mean lead time
-    lead_time_s: float | None
-    false_alarms_per_hour: float | None  # Rate on hazard-free recordings
-    window_rate: float | None
-    ece: float | None  # ECE of the risk on the same windows, with its sampling floor
-    ece_floor: float | None
-    brier: float | None
-    # Share of the hops after T0 with the vehicle in view in which it is detected or P(hidden) + P(visible) is
-    # above its threshold; below, the share in which it is detected.
-    awareness: float | None
-    vision_only: float | None
-    approach_weight: float  # Mean of the chosen weights
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scored:
-    """One held-out recording with the statistic, alarm and risk set on the calibration folds."""
-
-    stream: HopTable
-    statistic: FloatArray
-    risk: FloatArray
-    alarm: BoolArray
-    aware: BoolArray
-    weight: float
+# One held-out recording with statistic, risk, alarm, awareness and weight of the calibration folds.
+_Scored = tuple[HopTable, FloatArray, FloatArray, BoolArray, BoolArray, float]
 
 
 def evaluate_ablation(
     streams: Sequence[HopTable],
     reference_prior: Sequence[float],
     rng: np.random.Generator,
-    switches: AblationSwitches | None = None,
-) -> AblationRow:
+    switches: AblationSwitches,
+) -> dict[str, float | None]:
     """Evaluate one setting of the switches by recording-level folds.
 
     Parameters
@@ -122,8 +70,8 @@ def evaluate_ablation(
         Prior of the statistic.
     rng : numpy.random.Generator
         Assigns recordings to folds and draws the floor of the ECE.
-    switches : AblationSwitches, optional
-        Parts in use; by default all.
+    switches : AblationSwitches
+        Parts in use.
 
     Raises
     ------
@@ -132,8 +80,9 @@ def evaluate_ablation(
 
     Returns
     -------
-    AblationRow
-        Detection, lead time, false alarms and calibration with these switches.
+    dict of str to float
+        Detection, lead time, false alarms and calibration with these switches; None if the streams contain no
+        data for a figure.
 
     Examples
     --------
@@ -147,18 +96,17 @@ def evaluate_ablation(
     ...     columns |= dict.fromkeys(("answer", "seen", "there"), np.zeros(100, dtype=bool))
     ...     columns["miss_rate"] = np.ones(100)
     ...     return HopTable(columns, f"{i}", "left" if hazard else "none", 9.0 if hazard else np.nan)
-    >>> row = evaluate_ablation([stream(i) for i in range(20)], (0.25,) * 4, np.random.default_rng(0))
-    >>> row.detected
+    >>> streams, rng = [stream(i) for i in range(20)], np.random.default_rng(0)
+    >>> evaluate_ablation(streams, (0.25,) * 4, rng, AblationSwitches())["detected"]
     1.0
     """
-    chosen = switches or AblationSwitches()
     sites = [str(stream.about.get("site", "")) for stream in streams]
     folds = deal_folds([stream.label for stream in streams], sites, rng)
     scored: list[_Scored] = []
     for fold in np.unique(folds):
         others = [one for one, its in zip(streams, folds, strict=True) if its != fold]
-        learned = _Learned(others, reference_prior, chosen)
-        scored += [learned.score(one) for one, its in zip(streams, folds, strict=True) if its == fold]
+        score = _learned(others, reference_prior, switches)
+        scored += [score(one) for one, its in zip(streams, folds, strict=True) if its == fold]
     return _row(scored, rng)
 
 
@@ -166,10 +114,9 @@ def ablation_table(
     streams: Sequence[HopTable],
     reference_prior: Sequence[float],
     seed: int,
-    switches: AblationSwitches | None = None,
-) -> dict[str, AblationRow]:
+    base: AblationSwitches,
+) -> dict[str, dict[str, float | None]]:
     """Evaluate the full statistic, each part switched off, and looming added, on the same folds."""
-    base = switches or AblationSwitches()
     rows = {
         "full": base,
         "signature_only": replace(base, use_absence=False),
@@ -182,69 +129,72 @@ def ablation_table(
     }
 
 
-class _Learned:
-    """Weight, thresholds and risk map set on the calibration folds."""
+def _learned(
+    streams: Sequence[HopTable], prior: Sequence[float], switches: AblationSwitches
+) -> Callable[[HopTable], _Scored]:
+    """Set weight, thresholds and risk map on the calibration folds; return the score of other recordings."""
 
-    def __init__(
-        self, streams: Sequence[HopTable], prior: Sequence[float], switches: AblationSwitches
-    ) -> None:
-        free = [stream for stream in streams if stream.hazard_free]
-        parted = [*free, *(stream for stream in streams if stream.before_sight().any())]
-        self._prior, self._switches = prior, switches
-        self.weight = best_weight(parted, switches.approach_weights, self._statistic)
-        scores = [self._statistic(stream, self.weight) for stream in parted]
-        self.gamma = neyman_pearson_threshold(scores[: len(free)], switches.alpha, switches.sustain_hops)
-        presence = [self._presence(stream) for stream in free]
-        self.presence_gamma = neyman_pearson_threshold(presence, switches.alpha)
-        self._risk_map = None
-        if switches.calibrated and len(parted) > len(free):
-            self._risk_map = fit_isotonic(*labelled_windows(parted, scores))
+    def statistic(stream: HopTable, weight: float) -> FloatArray:
+        return stream_statistic(stream, prior, switches.use_absence, weight)
 
-    def score(self, stream: HopTable) -> _Scored:
-        statistic = self._statistic(stream, self.weight)
-        risk = statistic if self._risk_map is None else self._risk_map(statistic)
-        alarm = sustained_alarm(statistic >= self.gamma, self._switches.sustain_hops)
-        aware = stream.seen | (self._presence(stream) >= self.presence_gamma)
-        return _Scored(stream, statistic, risk, alarm, aware, self.weight)
+    def presence(stream: HopTable) -> FloatArray:
+        return presence_statistic(stream, prior, switches.use_absence)
 
-    def _statistic(self, stream: HopTable, weight: float) -> FloatArray:
-        return stream_statistic(stream, self._prior, self._switches.statistic_with(weight))
+    free = [stream for stream in streams if stream.hazard_free]
+    parted = [*free, *(stream for stream in streams if stream.before_sight().any())]
+    weight = best_weight(parted, switches.approach_weights, statistic)
+    scores = [statistic(stream, weight) for stream in parted]
+    gamma = neyman_pearson_threshold(scores[: len(free)], switches.alpha, switches.sustain_hops)
+    presence_gamma = neyman_pearson_threshold([presence(stream) for stream in free], switches.alpha)
+    calibrated = switches.calibrated and len(parted) > len(free)
+    risk_map = fit_isotonic(*labelled_windows(parted, scores)) if calibrated else None
 
-    def _presence(self, stream: HopTable) -> FloatArray:
-        return presence_statistic(stream, self._prior, self._switches.statistic_with(0.0))
+    def score(stream: HopTable) -> _Scored:
+        found = statistic(stream, weight)
+        risk = found if risk_map is None else risk_map(found)
+        alarm = sustained_alarm(found >= gamma, switches.sustain_hops)
+        return stream, found, risk, alarm, stream.seen | (presence(stream) >= presence_gamma), weight
+
+    return score
 
 
-def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> AblationRow:
-    free = [one for one in scored if one.stream.hazard_free]
-    approaches = [one for one in scored if one.stream.before_sight().any()]
-    parted = [*free, *approaches]
-    streams = [one.stream for one in parted]
-    statistic, hazards = labelled_windows(streams, [one.statistic for one in parted])
-    risk, _ = labelled_windows(streams, [one.risk for one in parted])
+def _row(scored: Sequence[_Scored], rng: np.random.Generator) -> dict[str, float | None]:
+    free = [one for one in scored if one[0].hazard_free]
+    approaches = [one for one in scored if one[0].before_sight().any()]
+    streams, statistics, risks, *_ = zip(*free, *approaches, strict=True)
+    statistic, hazards = labelled_windows(streams, statistics)
+    risk, _ = labelled_windows(streams, risks)
     found = ApproachTable(
-        [onset_outcome(one.stream.time_s[rising_edges(one.alarm)], one.stream.t0_s) for one in approaches],
-        [one.alarm for one in free],
+        [
+            onset_outcome(stream.time_s[rising_edges(alarm)], stream.t0_s)
+            for stream, _, _, alarm, *_ in approaches
+        ],
+        [alarm for _, _, _, alarm, *_ in free],
     ).figures()
     both = bool(approaches) and bool(free)
-    return AblationRow(
-        auroc=auroc(statistic, hazards),
-        detected=found["detected"],
-        lead_time_s=found["lead_s"],
-        false_alarms_per_hour=found["onsets_per_hour"],
-        window_rate=found["hazard_free_share"],
-        ece=expected_calibration_error(risk, hazards) if both else None,
-        ece_floor=calibration_error_sampling(risk, rng)[0] if both else None,
-        brier=brier_score(risk, hazards) if both else None,
-        awareness=mean_of([f for one in approaches for f in one.aware[one.stream.after_sight()]]),
-        vision_only=mean_of([f for one in approaches for f in one.stream.seen[one.stream.after_sight()]]),
-        approach_weight=float(np.mean([one.weight for one in scored])),
-    )
+    return {
+        "auroc": auroc(statistic, hazards),  # Of windows before T0 against hazard-free windows
+        # Share of approaches announced before T0, their mean lead time, the rate on hazard-free recordings
+        "detected": found["detected"],
+        "lead_time_s": found["lead_s"],
+        "false_alarms_per_hour": found["onsets_per_hour"],
+        "window_rate": found["hazard_free_share"],
+        # ECE of the risk on the same windows, with its sampling floor
+        "ece": expected_calibration_error(risk, hazards) if both else None,
+        "ece_floor": calibration_error_sampling(risk, rng)[0] if both else None,
+        "brier": brier_score(risk, hazards) if both else None,
+        # Share of the hops after T0 with the vehicle in view in which it is detected or P(hidden) +
+        # P(visible) is above its threshold; below, the share in which it is detected.
+        "awareness": mean_of([f for one, *_, aware, _ in approaches for f in aware[one.after_sight()]]),
+        "vision_only": mean_of([f for one, *_ in approaches for f in one.seen[one.after_sight()]]),
+        "approach_weight": float(np.mean([weight for *_, weight in scored])),  # Mean of the chosen weights
+    }
 
 
 def presence_statistic(
-    stream: HopTable, reference_prior: Sequence[float], switches: StatisticSwitches
+    stream: HopTable, reference_prior: Sequence[float], use_absence: bool = True
 ) -> FloatArray:
     """Return P(hidden) + P(visible), the probability of any vehicle, at a fixed prior per hop, shape (n,)."""
-    joint = log_joint(stream, reference_prior, switches)
+    joint = log_joint(stream, reference_prior, use_absence)
     something = np.logaddexp.reduce(joint[:, :-1], axis=1)
     return np.asarray(np.exp(-np.logaddexp(0.0, joint[:, -1] - something)))

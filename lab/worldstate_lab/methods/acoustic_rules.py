@@ -11,7 +11,7 @@ from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.metrics.approach_table import auroc, onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.metrics.stream_statistic import StatisticSwitches, stream_statistic
+from worldstate_lab.metrics.stream_statistic import stream_statistic
 from worldstate_lab.trials.classification import SIDE_COLUMNS, posteriors
 from worldstate_lab.trials.trial import LEFT, RIGHT, Decide, Decisions, Trial
 
@@ -149,9 +149,8 @@ class CalibratedCue:
         return decide
 
     def _statistic(self, hops: HopTable, weight: float) -> FloatArray:
-        switches = StatisticSwitches(use_absence=self.absence, approach_weight=weight)
         stream = hops.replace(log_likelihoods=hops.columns[self.evidence])
-        return stream_statistic(stream, hops.about["prior"][self.evidence], switches)
+        return stream_statistic(stream, hops.about["prior"][self.evidence], self.absence, weight)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Effect of the camera, its miss rates and eq. (5) on real recordings, and awareness by camera state."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -20,7 +20,6 @@ from worldstate.operations.metrics.approach_table import (
 )
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate_lab.evaluation.ablation_rows import (
-    AblationRow,
     AblationSwitches,
     ablation_table,
     evaluate_ablation,
@@ -55,7 +54,7 @@ def corner_rows(
     prior = list(chain.model.signature.reference_prior)
     by_statistic = statistic_rows(made["product"], prior, seed, switches)
     return {
-        "statistic": {name: asdict(row) for name, row in by_statistic.items()},
+        "statistic": by_statistic,
         "product": {name: product_row(some, np.random.default_rng(seed)) for name, some in made.items()},
     }
 
@@ -94,7 +93,7 @@ def last_seen_s(recordings: Sequence[CornerRecording], chain: Chain) -> dict[str
 
 def statistic_rows(
     streams: Sequence[HopTable], prior: Sequence[float], seed: int, switches: AblationSwitches
-) -> dict[str, AblationRow]:
+) -> dict[str, dict[str, float | None]]:
     """Return the rows of the paper's statistic: each part off, the camera fully trusted, eq. (5) on."""
     trusted = [one.replace(miss_rate=np.full(len(one), _NEVER)) for one in streams]
     changed = {

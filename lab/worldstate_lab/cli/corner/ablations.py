@@ -18,7 +18,6 @@ Examples
 """
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 
 from worldstate.adapters.camera.camera_health import LEVELS
@@ -57,9 +56,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         return _corner(arguments, model, switches)
     streams = read_streams(arguments.inputs, given_array(arguments), arguments.model)
     table = ablation_table(streams, policy.reference_prior, arguments.seed, switches)
-    rows = {name: asdict(row) for name, row in table.items()}
-    report = {"recordings": len(streams), "alpha": arguments.alpha, "rows": rows}
-    return CommandResult(report, table={}, lines=figure_lines(rows))
+    report = {"recordings": len(streams), "alpha": arguments.alpha, "rows": table}
+    return CommandResult(report, table={}, lines=figure_lines(table))
 
 
 def _corner(arguments: argparse.Namespace, model: Model, switches: AblationSwitches) -> CommandResult:
