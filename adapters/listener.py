@@ -164,13 +164,11 @@ class Listener:
         **parts: Unpack[SourceParts],
     ) -> None:
         self._blind = not isinstance(array, Source) and parts.get("camera") is None
-        if not isinstance(array, Source):
-            source = open_source(PUSHED, array=array, start_s=start_s or 0.0, **parts)
-        elif parts or start_s is not None:
+        if isinstance(array, Source) and (parts or start_s is not None):
             given = ", ".join(parts) or "start_s"
             raise InvalidArgumentError(f"{given}: expected nothing beside a source, which has all of it")
-        else:
-            source = array
+        begins_s = start_s or 0.0
+        source = array if isinstance(array, Source) else open_source(PUSHED, array, start_s=begins_s, **parts)
         if spectra is not None:
             # No threshold was calibrated with this front-end, so the states give no budget.
             source = replaced(source, policy=replaced(source.policy, alpha=0.0))
@@ -357,10 +355,9 @@ class Listener:
     def _is_near(self, stamp_ns: int, name: str) -> bool:
         """Return whether a time stamp is near the pushed sound; otherwise count it as refused."""
         far_ns = stamp_ns - self._now_ns()
-        if near := abs(far_ns) <= LAG_NS:
-            return near
-        got = f"refused, because its time stamp is {seconds(far_ns):.1f} s from the sound"
-        self.refuse(1, name, f"a measurement is {got}; at most {seconds(LAG_NS):.0f} s are allowed")
+        if not (near := abs(far_ns) <= LAG_NS):
+            got = f"refused, because its time stamp is {seconds(far_ns):.1f} s from the sound"
+            self.refuse(1, name, f"a measurement is {got}; at most {seconds(LAG_NS):.0f} s are allowed")
         return near
 
     def checkpoint(self) -> Checkpoint:
@@ -423,8 +420,10 @@ class Listener:
 
     def _frames(self, block: Float32Array | None) -> Iterator[AcousticFrame]:
         """Yield the front-end output of the hops that end in the next samples, or of the last hop."""
-        hear = self._adapter.front_end
-        for part in [None] if block is None else self._parts(block):
+        hear, samples = self._adapter.front_end, 0 if block is None else len(block)
+        # Parts in which at most one hop ends, so that waiting measurements are passed on before later hops.
+        for start in [0] if block is None else range(0, samples, self._part):
+            part = None if block is None else block[start : start + self._part]
             frames = hear.finish() if part is None else hear.process(part)
             self._samples += 0 if part is None else len(part)
             self._take_due()
@@ -434,11 +433,6 @@ class Listener:
                     yield frame
         while self._ahead and not self._is_near(*self._ahead[-1][:2]):
             self._ahead_bytes -= self._ahead.pop()[-1]
-
-    def _parts(self, block: Float32Array) -> Iterator[Float32Array]:
-        """Split a block so that at most one hop ends in each part."""
-        # Parts are this short so that waiting measurements are passed on before later hops.
-        return (block[start : start + self._part] for start in range(0, len(block), self._part))
 
 
 def _of_recording(opened: Callable[P, Source]) -> Callable[[Callable[[Source], T]], Callable[P, T]]:

@@ -38,6 +38,12 @@ _WIDE_PX = 4.0
 QUANTILES = 1 << 16
 
 
+def check_image(frame: ImageArray, least_px: int = 0) -> None:
+    """Refuse an array that is no image, or an image with a shorter side."""
+    if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or min(frame.shape[:2]) < least_px:
+        raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
+
+
 def strength(family: str, degradation: float) -> float:
     """Return the strength of a family, except ``"all"``, at a degradation d in [0, 1]."""
     # Linear between the levels; darkness is linear in the logarithm.
@@ -63,13 +69,11 @@ def degrade(frame: ImageArray, family: Family, degradation: float, rng: np.rando
 
     Shapes: frame (height, width).
     """
-    if frame.dtype != np.uint8 or frame.ndim not in (2, 3):
-        raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
+    check_image(frame)
     one_of("family", family, FAMILIES)
     if degradation == 0.0:
         return frame
-    staged = tuple(STRENGTHS) if family == "all" else (family,)
-    for name in staged:
+    for name in STRENGTHS if family == "all" else (family,):
         frame = _STAGES[name](frame, strength(name, degradation), rng)
     return frame
 
@@ -159,8 +163,7 @@ def image_quality(frame: ImageArray) -> ImageQuality:
     # The noise is estimated by the median absolute deviation of a second difference, in which smooth surfaces
     # and straight edges cancel. The sharpness compares the gradient at two scales, without the contribution
     # of white noise to each.
-    if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or min(frame.shape[:2]) < 16:
-        raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
+    check_image(frame, least_px=16)
     # Imported here: it takes as long as all other imports of a run without a camera together.
     from scipy.ndimage import convolve
 

@@ -16,6 +16,7 @@ from worldstate.ground.extras import optional
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 
 from .box_linking import overlaps
+from .camera_health import check_image
 from .detections import MAX_BOXES_A_FRAME, DetectionFrame
 
 # No edge of an image is narrower: pixels have a size, and noise is smoothed before the search.
@@ -92,15 +93,12 @@ class MotionDetector:
         InvalidArgumentError
             If the frame is not an image of uint8.
         """
-        if frame.dtype != np.uint8 or frame.ndim not in (2, 3) or not frame.size:
-            raise InvalidArgumentError(f"frame: expected an image of uint8, got {frame.dtype} {frame.shape}")
-        height, width = frame.shape[:2]
+        check_image(frame, least_px=1)
         small = reduced_to(frame, WIDTH_PX)
-        mask = self._moving(small)
-        self._seen += 1
+        mask, self._seen = self._moving(small), self._seen + 1
         if self._seen <= WARM_UP:
             return DetectionFrame(np.empty((0, 4)), np.empty(0), ())
-        scale = np.array([width, height] * 2) / np.array([small.shape[1], small.shape[0]] * 2)
+        scale = np.tile(frame.shape[1::-1], 2) / np.tile(small.shape[1::-1], 2)
         return self._objects(small, mask, scale)
 
     def _make_background(self, kind: Background) -> Any:
@@ -261,8 +259,7 @@ class OnnxDetector:
         except Exception as error:  # onnxruntime raises its own bare classes
             raise OwnPartError(self._name, error) from error
         boxes, scores, classes = decode_yolo(outputs[0], len(self._labels))
-        limits = np.array([frame.shape[1], frame.shape[0]] * 2, dtype=np.float64)
-        return self._best(np.clip(boxes / scale, 0.0, limits), scores, classes)
+        return self._best(np.clip(boxes / scale, 0.0, np.tile(frame.shape[1::-1], 2)), scores, classes)
 
     def _letterbox(self, frame: ImageArray) -> tuple[Float32Array, float]:
         cv2 = optional("cv2")

@@ -263,28 +263,16 @@ def named_array(path: Path) -> Path | None:
     return next((root / ARRAY_NAME for root in roots if (root / ARRAY_NAME).is_file()), None)
 
 
-def check_channels(path: Path, array: MicrophoneArray) -> None:
-    """Refuse a sound file without an array file that does not match the channels of the assumed array.
-
-    Raises
-    ------
-    InputFileError
-        If the numbers differ; the message contains a remedy.
-    """
-    with open_audio(path, strict=False) as audio:
-        if audio.channels != array.n_microphones:
-            boards = ", ".join(named_arrays())
-            wanted = (
-                f"expected --array (array=) for its {audio.channels} channels: a file, or one of {boards}"
-            )
-            other = f"the default, {array.name}, has {array.n_microphones}; {ARRAY_NAME} beside it works, too"
-            ways = "`worldstate model make` makes a model for it, `worldstate array bearings` needs none"
-            raise InputFileError(path, f"{wanted}; {other}. With the array {ways}")
-
-
 def _assumed(path: Path, array: MicrophoneArray) -> MicrophoneArray:
     """Return the array assumed for a sound file, if the number of channels matches."""
-    check_channels(path, array)
+    with open_audio(path, strict=False) as audio:
+        channels = audio.channels
+    if channels != array.n_microphones:
+        boards = ", ".join(named_arrays())
+        wanted = f"expected --array (array=) for its {channels} channels: a file, or one of {boards}"
+        other = f"the default, {array.name}, has {array.n_microphones}; {ARRAY_NAME} beside it works, too"
+        ways = "`worldstate model make` makes a model for it, `worldstate array bearings` needs none"
+        raise InputFileError(path, f"{wanted}; {other}. With the array {ways}")
     _LOG.warning("%s: no array is named; taken as %s, %d microphones", path, array.name, array.n_microphones)
     return array
 

@@ -13,7 +13,7 @@ from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import IndexArray
 
-from .array_match import TRAIN, WAY_OUT, matched_order
+from .array_match import TRAIN, WAY_OUT, array_difference, microphone_order
 from .model_file import Model
 from .odometry_file import STANDING_MPS
 
@@ -51,7 +51,12 @@ def check_array(domain: ModelDomain, array: MicrophoneArray, way_out: str = TRAI
     OutOfDomainError
         If the positions differ; the message contains the array, the difference and a remedy.
     """
-    return matched_order(array_of(domain), array, way_out)
+    order = microphone_order(domain.positions_m, array)
+    if order is None:
+        difference = array_difference(domain.positions_m, array)
+        model = f"{domain.array}, {len(domain.positions_m)} microphones"
+        raise OutOfDomainError(f"{array.name}: not the array of the model ({model}): {difference}. {way_out}")
+    return order
 
 
 def array_of(domain: ModelDomain) -> MicrophoneArray:

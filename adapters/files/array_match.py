@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import FloatArray, IndexArray
 
 # Array files are accurate to a millimetre; half a wavelength at the top of the feature's band is 114 mm.
@@ -63,28 +62,6 @@ def array_difference(expected_m: FloatArray, array: MicrophoneArray) -> str:
     largest_m = float(np.linalg.norm(found - expected, axis=1).max())
     apart = f"microphones up to {1e3 * largest_m:.0f} mm elsewhere"
     return "; ".join(filter(None, (apart, _cause(expected, found))))
-
-
-def matched_order(made_for: MicrophoneArray, array: MicrophoneArray, way_out: str = TRAIN) -> IndexArray:
-    """Return the channels of `array` in the order of the array of a model.
-
-    Raises
-    ------
-    OutOfDomainError
-        If the positions differ; the message contains the array, the difference and a remedy.
-
-    Examples
-    --------
-    >>> pair = MicrophoneArray([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]])
-    >>> matched_order(pair, pair)
-    array([0, 1])
-    """
-    order = microphone_order(made_for.positions_m, array)
-    if order is None:
-        difference = array_difference(made_for.positions_m, array)
-        model = f"{made_for.name}, {made_for.n_microphones} microphones"
-        raise OutOfDomainError(f"{array.name}: not the array of the model ({model}): {difference}. {way_out}")
-    return order
 
 
 def by_number(path: Path, names: Sequence[str]) -> list[int]:
