@@ -294,9 +294,7 @@ class Asked:
 @pytest.mark.parametrize(
     ("deep", "name", "labels"), [(True, "truck", {"truck", "bus"}), (False, "car", {"car"})]
 )
-def test_the_acoustic_kind_sets_the_camera_query_and_the_entity(
-    deep: bool, name: str, labels: set[str]
-) -> None:
+def test_the_acoustic_kind_sets_the_camera_query_and_the_entity(deep, name, labels) -> None:
     asked = Asked()
     found = unwatched(SURE, asked, road_users=by_colour()).measure(coloured(deep))
     assert [one.kinds for one in found[:11]] == [()] * 11

@@ -1,25 +1,19 @@
 """Sound of any rate from 8 kHz up gives the states of 48 kHz, from files, pipes, bags and microphones."""
 
 import io
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import firwin, resample_poly
 
-from worldstate.adapters.audio.sound_file import RawPcm, SoundInput, open_sound
+from worldstate.adapters.audio.sound_file import RawPcm, SoundInput
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.listener import Step, listen_steps
-from worldstate.adapters.live.live_sound import LiveSound, Playback
-from worldstate.adapters.ros.bag_input import read_bag
-from worldstate.adapters.ros.bag_writer import write_bag
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.commissioning.commission import commission
 from worldstate.commissioning.heard_stream import CommissionSettings, quick_settings
@@ -113,37 +107,6 @@ def test_states_do_not_depend_on_the_sample_rate(heard: Heard, at_full_rate: lis
         assert all(abs(said.get(what, 0.0) - chance) < 0.02 for what, chance in chances(other).items())
         np.testing.assert_allclose(one.frame.feature, other.frame.feature, atol=1e-3)
         np.testing.assert_allclose(one.frame.band_log_energy, other.frame.band_log_energy, atol=0.01)
-
-
-def as_file(heard: Heard, rate: int, folder: Path) -> SoundInput:
-    soundfile.write(folder / "street.wav", heard.at(rate), rate, "FLOAT")
-    return folder / "street.wav"
-
-
-def as_bag(heard: Heard, rate: int, folder: Path) -> SoundInput:
-    for _ in write_bag(folder / "bag", as_file(heard, rate, folder), heard.array):
-        pass
-    return read_bag(folder / "bag").sound
-
-
-def as_live(heard: Heard, rate: int, folder: Path) -> SoundInput:
-    return LiveSound(Playback(open_sound(as_file(heard, rate, folder)), speed=3.0))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("rate", [16_000, 44_100])
-@pytest.mark.parametrize("form", [as_file, as_bag, as_live])
-def test_files_bags_and_microphones_give_the_states_of_a_pipe(
-    heard: Heard, rate: int, form: Callable[[Heard, int, Path], SoundInput], tmp_path: Path
-) -> None:
-    if heard.array is not RING:
-        pytest.skip("the same code for any array")
-    start_ns = (found := heard.steps(form(heard, rate, tmp_path)))[0].state.stamp_ns - 10**9
-    expected = heard.steps(heard.pipe(rate))
-    assert [one.state.stamp_ns - start_ns for one in found] == [one.state.stamp_ns for one in expected]
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.frame.feature, other.frame.feature)
-        assert one.frame.bearing_rad == other.frame.bearing_rad
 
 
 @pytest.mark.parametrize("rate", [44_056, 43_000, 47_000, 7_000])

@@ -174,9 +174,7 @@ def test_any_bytes_as_an_array(tmp_path_factory: pytest.TempPathFactory, data: b
 
 
 @pytest.mark.parametrize(("radius_m", "said"), [(0.05, False), (0.6, False), (1.5, True), (2.0, True)])
-def test_a_ring_of_doubtful_units_logs_a_warning(
-    radius_m: float, said: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_ring_of_doubtful_units_logs_a_warning(radius_m, said, tmp_path, caplog) -> None:
     rows = ((radius_m, 0.0), (0.0, radius_m), (-radius_m, 0.0), (0.0, -radius_m))
     (tmp_path / "ring.csv").write_text("".join(f"{x},{y},0\n" for x, y in rows))
     assert read_array(tmp_path / "ring.csv").n_microphones == 4
@@ -184,9 +182,7 @@ def test_a_ring_of_doubtful_units_logs_a_warning(
 
 
 @pytest.mark.parametrize("form", ["csv", "header", "xml"])
-def test_microphones_sorted_as_text_are_ordered_by_number(
-    form: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_microphones_sorted_as_text_are_ordered_by_number(form, tmp_path, caplog) -> None:
     places = [[0.1 * number, 0.0, 1.0] for number in range(1, 13)]
     for order, said in ((sorted(range(1, 13), key=str), True), (range(1, 13), False)):
         rows = [(f"mic_{number}", *places[number - 1]) for number in order]
@@ -240,9 +236,7 @@ def pair(spacing_m: float) -> MicrophoneArray:
         (roof_array_56(), 47_998, (300.0, 1800.0)),  # Exactly the paper's band
     ],
 )
-def test_the_band_follows_the_spacing(
-    array: MicrophoneArray, rate_hz: float, band_hz: tuple[float, float]
-) -> None:
+def test_the_band_follows_the_spacing(array, rate_hz, band_hz) -> None:
     assert default_band_hz(array, rate_hz) == band_hz
 
 

@@ -125,9 +125,7 @@ def scaled(log: DetectionLog, by: float) -> DetectionLog:
     keep=st.sampled_from([DetectionFilter(), DetectionFilter(min_height_px=60.0)]),
 )
 @settings(deadline=None)
-def test_image_and_boxes_scaled_together_change_nothing(
-    by: float, height_px: float, step_px: float, keep: DetectionFilter
-) -> None:
+def test_image_and_boxes_scaled_together_change_nothing(by, height_px, step_px, keep) -> None:
     frames = [boxed((900.0 + step_px * k, 500.0, 1000.0, 500.0 + height_px)) for k in range(40)]
     log = DetectionLog.at_rate(frames, 10.0)
     width_px, height = round(by * CAMERA.width_px), round(by * CAMERA.height_px)
@@ -175,9 +173,7 @@ def in_view(log: DetectionLog | None, hops: Sequence[int]) -> list[tuple[float, 
     st.floats(0.01, 1.0), st.floats(1.0, 300.0), st.sampled_from(["car", "truck", "Milk Float", "DontCare"])
 )
 @settings(deadline=None, max_examples=25)
-def test_an_ignored_box_never_lowers_the_visible_hypothesis(
-    score: float, height_px: float, label: str
-) -> None:
+def test_an_ignored_box_never_lowers_the_visible_hypothesis(score, height_px, label) -> None:
     hops = range(12, 24)
     seen, alone = (in_view(log, hops) for log in (moving(label, score, height_px), None))
     assert all(a[0] >= b[0] - 1e-9 for a, b in zip(seen, alone, strict=True))

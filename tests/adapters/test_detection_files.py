@@ -379,9 +379,7 @@ def test_ids_without_an_order_are_refused_with_a_remedy(tmp_path: Path, ids: tup
             read_any_detections(written(tmp_path / "c.json", document))
 
 
-def test_results_may_name_their_images_and_lack_scores(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_results_may_name_their_images_and_lack_scores(tmp_path, caplog) -> None:
     named = [RESULT | {"image_id": f"street_{i}"} for i in (3, 0, 13)]
     log = read_any_detections(written(tmp_path / "c.json", named), 10.0)
     assert [i for i, frame in enumerate(log.frames) if len(frame)] == [0, 3, 13]
@@ -392,9 +390,7 @@ def test_results_may_name_their_images_and_lack_scores(
 
 
 @given(stamps=st.lists(st.integers(0, 9), min_size=1, max_size=12))
-def test_images_and_odometry_are_sorted_and_the_last_duplicate_counts(
-    stamps: list[int], tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_images_and_odometry_are_sorted_and_the_last_duplicate_counts(stamps, tmp_path_factory) -> None:
     folder = tmp_path_factory.getbasetemp()
     rows = [GOOD | {"scores": [k / 100], "stamp_ns": stamp * 10**8} for k, stamp in enumerate(stamps)]
     (folder / "d.json").write_text(frames(*rows))

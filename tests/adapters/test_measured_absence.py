@@ -229,15 +229,3 @@ def test_the_command_writes_table_and_figure(tmp_path, capsys):
     assert summary["beta_harshest_boresight"] == pytest.approx(rates.table(0.0, 1.0))
     assert rates.provenance["detector"] == "motion"
     assert figure.read_bytes()[:4] == b"\x89PNG"
-
-
-def test_bad_input_of_the_command_is_one_line(tmp_path, capsys):
-    text = tmp_path / "text.mp4"
-    text.write_text("no video")
-    for path in (tmp_path / "missing.mp4", text, tmp_path):
-        assert main(["model", "detector", str(path), "--out", str(tmp_path / "beta.json")]) == 2
-        assert path.name in capsys.readouterr().err
-    out = ["--out", str(tmp_path / "b.json")]
-    assert main(["model", "detector", str(text), "--detector", "onnx", *out]) == 2
-    assert "FILE.onnx" in capsys.readouterr().err
-    assert not (tmp_path / "beta.json").exists()

@@ -1,11 +1,9 @@
 """Data beside the sound must be on its clock; otherwise an error gives the remedy."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -65,9 +63,7 @@ OFF_S = (1.7e9, 37.0, -37.0, 18.0, 19.0, 3600.0, -86_400.0, 60.0)
 
 @pytest.mark.parametrize("off_s", OFF_S)
 @pytest.mark.parametrize("start_s", STARTS_S)
-def test_stamps_on_another_clock_are_refused_and_the_offset_brings_them_back(
-    sound: Path, off_s: float, start_s: float
-) -> None:
+def test_stamps_on_another_clock_are_refused_and_the_offset_brings_them_back(sound, off_s, start_s) -> None:
     stamps = np.array([nanoseconds(start_s + off_s + 0.1 * i) for i in range(200)])
     log = DetectionLog((EMPTY,) * 200, stamps, "boxes.json")
     with pytest.raises(InputFileError, match=r"boxes\.json: .*\"stamp_offset_s\": ") as refused:
@@ -121,9 +117,7 @@ def test_odometry_in_another_unit_is_refused(sound: Path, by: float) -> None:
     [(0.0, 20.0, ""), (-3.0, 22.0, ""), (4.0, 19.0, ""), (15.0, 35.0, "cover 5.0 of its 20.0 s"),
      (0.0, 6.0, "60 of 60 stamps"), (-30.0, 60.0, "of 900 stamps lie within the sound")],
 )  # fmt: skip
-def test_a_small_overlap_with_the_sound_logs_a_warning(
-    sound: Path, first_s: float, last_s: float, told: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_small_overlap_with_the_sound_logs_a_warning(sound, first_s, last_s, told, caplog) -> None:
     stamps = np.array([nanoseconds(s) for s in np.arange(first_s, last_s, 0.1)])
     heard(sound, detections=DetectionLog((EMPTY,) * len(stamps), stamps))
     assert told in caplog.text and bool(told) == bool(caplog.text)
@@ -133,9 +127,7 @@ def test_a_small_overlap_with_the_sound_logs_a_warning(
 
 
 @pytest.mark.parametrize("rate_hz", [8.0, 9.0, 9.5, 10.4])
-def test_a_rate_near_the_assumed_one_logs_a_warning(
-    sound: Path, rate_hz: float, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_rate_near_the_assumed_one_logs_a_warning(sound, rate_hz, caplog) -> None:
     heard(sound, detections=DetectionLog.at_rate([EMPTY] * round(rate_hz * LENGTH_S), None))
     assert "stamps lie within the sound" in caplog.text
     caplog.clear()
@@ -159,9 +151,7 @@ DRIVE = {
 
 
 @pytest.mark.parametrize("name", DRIVE)
-def test_odometry_in_other_units_logs_a_warning(
-    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_odometry_in_other_units_logs_a_warning(tmp_path, name, caplog) -> None:
     other, told = DRIVE[name]
     lines = ["time_s, speed_mps, yaw_rate_rad_s, x_m, y_m, yaw_rad"]
     for i in range(100):
@@ -204,9 +194,7 @@ OTHER_HZ = 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 60.0, 7.5, 5.0, 1.0
 
 @pytest.mark.parametrize("written", [ovad_json, coco_json, yolo_text, mot_text])
 @pytest.mark.parametrize("rate_hz", [*TEN_HZ, *OTHER_HZ])
-def test_an_assumed_rate_must_fit_the_sound(
-    sound: Path, tmp_path: Path, written: Callable[[Path, int], Path], rate_hz: float
-) -> None:
+def test_an_assumed_rate_must_fit_the_sound(sound, tmp_path, written, rate_hz) -> None:
     images = round(rate_hz * LENGTH_S)
     path = written(tmp_path, images)
     if rate_hz in TEN_HZ or (written is mot_text and rate_hz < 10.0):  # Lines do not end with the images
@@ -309,9 +297,7 @@ def test_an_unreadable_early_look_is_counted_alone() -> None:
         (1.0, boxes(100_000), 50, 0),  # of near ones those of a second are kept, with 64 boxes
     ],
 )
-def test_waiting_looks_and_odometry_are_bounded(
-    at_s: float, told: Any, tries: int, refused: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_waiting_looks_and_odometry_are_bounded(at_s, told, tries, refused, monkeypatch) -> None:
     monkeypatch.setattr("worldstate.adapters.listener.MOST_AHEAD", 100)
     listener = three()
     for k in range(tries):

@@ -18,7 +18,6 @@ from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoin
 from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.adapters.source import ListenSettings
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground import InvalidArgumentError, nanoseconds
 from worldstate.ground.typing import Float32Array
 
@@ -89,16 +88,6 @@ def test_pushed_states_equal_run_for_any_block_size(size, tmp_path, model, capsy
     listener = Listener(tmp_path / "three.xml", RATE_HZ, model=tmp_path / "model.json")
     blocks = [*np.split(SOUND, range(size, len(SOUND), size)), None]
     assert [one.to_json() for block in blocks for one in listener.push(block)] == out.read_text().splitlines()
-
-
-@pytest.mark.long
-def test_the_pushed_demo_recording_equals_run(approach, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    out = tmp_path / "states.jsonl"
-    assert main(["run", str(approach.audio_path), "--out", str(out)]) == 0
-    with soundfile.SoundFile(approach.audio_path) as sound:
-        listener = Listener(ovad_array(), sound.samplerate)
-        states = [state for block in sound.blocks(480, dtype="float32") for state in listener.push(block)]
-    assert [state.to_json() for state in [*states, *listener.push(None)]] == out.read_text().splitlines()
 
 
 def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path, model: Model) -> None:

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from made_up_sequence import sequence_model
 from made_up_sound import THREE
 
@@ -64,17 +62,6 @@ def steps(folder: Path, model: Model | None = None, **options: object) -> Iterat
 @pytest.fixture(scope="module")
 def whole(folder: Path) -> list[Step]:
     return list(steps(folder))
-
-
-@pytest.mark.long
-@settings(max_examples=20)
-@given(cuts=st.lists(st.integers(0, 3 * RATE_HZ), max_size=20))
-def test_states_are_the_same_to_the_bit_for_blocks_of_any_length(folder, whole, cuts) -> None:
-    sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
-    source = open_source(folder / "sound.wav", model=folder / "model.json")
-    listener = Listener(source, RATE_HZ)
-    states = [state for block in np.split(sound, sorted(cuts)) for state in listener.push(block)]
-    assert [state.to_json() for state in states] == [step.state.to_json() for step in whole]
 
 
 def test_measurements_take_effect_at_their_stamp_across_a_checkpoint(folder: Path) -> None:

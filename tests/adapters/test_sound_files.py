@@ -186,9 +186,7 @@ def with_size(path: Path, container: str, size: int, subtype: str = "PCM_16", ta
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24", "FLOAT"])
 @pytest.mark.parametrize("container", ["WAV", "WAVEX", "RF64", "BW64", "W64"])
-def test_a_file_with_an_open_size_is_read_with_a_warning(
-    tmp_path: Path, container: str, subtype: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_file_with_an_open_size_is_read_with_a_warning(tmp_path, container, subtype, caplog) -> None:
     for size in OPEN_SIZES if container.startswith("WAV") else (0, *OPEN_SIZES[1:5], 2**64 - 1):
         caplog.clear()
         found = heard(
@@ -204,9 +202,7 @@ def test_a_file_with_an_open_size_is_read_with_a_warning(
     container=st.sampled_from(["WAV", "RF64", "BW64"]),
 )
 @settings(max_examples=40, deadline=None)
-def test_a_wrong_size_never_drops_samples_silently(
-    tmp_path_factory: pytest.TempPathFactory, share: float, more: int, container: str
-) -> None:
+def test_a_wrong_size_never_drops_samples_silently(tmp_path_factory, share, more, container) -> None:
     path, there = tmp_path_factory.mktemp("size") / "a.wav", 9001 * 6
     with_size(path, container, int(share * there))
     assert len(heard(path)) == 9001
@@ -219,9 +215,7 @@ CHUNK = b"LIST" + struct.pack("<I", 10) + b"INFOISFTab"
 
 @pytest.mark.parametrize("tail", [b"", CHUNK, CHUNK + b"id3 " + struct.pack("<I", 3) + b"abc\0", b"\0"])
 @pytest.mark.parametrize("container", ["WAV", "RF64"])
-def test_chunks_after_the_samples_are_ignored(
-    tmp_path: Path, container: str, tail: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_chunks_after_the_samples_are_ignored(tmp_path, container, tail, caplog) -> None:
     np.testing.assert_allclose(
         heard(with_size(tmp_path / "a.wav", container, 9001 * 6, tail=tail)), noise(), atol=2e-4
     )
@@ -229,9 +223,7 @@ def test_chunks_after_the_samples_are_ignored(
 
 
 @pytest.mark.parametrize("tail", [b"", CHUNK])
-def test_a_size_beyond_32_bits_is_recovered(
-    tmp_path: Path, tail: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_size_beyond_32_bits_is_recovered(tmp_path, tail, caplog) -> None:
     """A sparse file: 8,000 samples, a hole of 4 GiB and one more sample."""
     name, frame = tmp_path / "long.wav", 6
     frames = (2**32 + 48_000) // frame
@@ -294,9 +286,7 @@ def test_every_encoding_is_decoded(encoding: Encoding, scale: float, channels: i
 @pytest.mark.parametrize("encoding", ["s24_32", "f32", "s32"])
 @given(scale=st.floats(1e-3, 0.3), channels=st.sampled_from([1, 2, 4, 6, 7, 8, 16]))
 @settings(max_examples=8, deadline=None)
-def test_samples_of_four_bytes_are_not_read_as_three(
-    encoding: Encoding, read_as: Encoding, scale: float, channels: int
-) -> None:
+def test_samples_of_four_bytes_are_not_read_as_three(encoding, read_as, scale, channels) -> None:
     data = stored(noise(12_000, channels, scale), encoding)
     if encoding == "s32":
         data = (np.frombuffer(data, "<i4") & ~0xFF).astype("<i4").tobytes()  # of a converter of 24 bits
@@ -337,9 +327,7 @@ FORMS: tuple[str, ...] = (*SUBTYPES, "s16, big-endian")
     dead=st.sampled_from([0, 3, 99]),
 )
 @settings(max_examples=8, deadline=None)
-def test_sound_of_one_encoding_is_refused_as_another(
-    encoding: str, read_as: Encoding, scale: float, channels: int, dead: int
-) -> None:
+def test_sound_of_one_encoding_is_refused_as_another(encoding, read_as, scale, channels, dead) -> None:
     form = cast("Encoding", encoding.partition(",")[0])
     data = stored(street_sound(12_000, channels, scale, dead if encoding == read_as else 99), form)
     if encoding == "s16, big-endian":
@@ -374,9 +362,7 @@ def test_a_header_with_another_encoding_is_refused(tmp_path: Path, held: str) ->
 
 
 @pytest.mark.parametrize(("scale", "said"), [(1.0, False), (3.0, False), (32_768.0, True), (2.0**31, True)])
-def test_floats_beyond_full_scale_log_a_warning(
-    tmp_path: Path, scale: float, said: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_floats_beyond_full_scale_log_a_warning(tmp_path, scale, said, caplog) -> None:
     soundfile.write(tmp_path / "a.wav", noise() * scale, RATE_HZ, subtype="DOUBLE")
     with open_audio(tmp_path / "a.wav"):
         assert ("beyond the full scale" in caplog.text) is said
@@ -394,9 +380,7 @@ NAMES = {
     "pattern", ["mic_{}.wav", "ch{}.wav", "2024-05-01 street {} left.wav", "m{}/rec.wav"]
 )
 @pytest.mark.parametrize("case", NAMES)
-def test_numbered_files_are_ordered_by_number_or_log_a_warning(
-    tmp_path: Path, case: str, pattern: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_numbered_files_are_ordered_by_number_or_log_a_warning(tmp_path, case, pattern, caplog) -> None:
     numbers, by_number = NAMES[case]
     samples, names = noise(channels=12), [tmp_path / pattern.format(number) for number in numbers]
     names = [name.with_name(name.name.upper()) if i % 2 else name for i, name in enumerate(names)]

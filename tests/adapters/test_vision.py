@@ -43,9 +43,7 @@ def test_unqueried_has_its_reason() -> None:
 
 @given(first_px=st.floats(200.0, 500.0), step_px=st.floats(10.0, 30.0), hop=st.integers(10, 39))
 @settings(deadline=None)
-def test_a_moving_car_is_found_in_its_sector_and_nowhere_else(
-    first_px: float, step_px: float, hop: int
-) -> None:
+def test_a_moving_car_is_found_in_its_sector_and_nowhere_else(first_px, step_px, hop) -> None:
     asked, stamp_ns = query(crossing(first_px, step_px)), nanoseconds(hop / 10)
     (seen,) = asked.sightings(stamp_ns)
     assert seen.moving
@@ -105,9 +103,7 @@ def same(one: CoEvidence, other: CoEvidence) -> bool:
     sides=st.sampled_from([(None, None), ("left", "right"), ("right", "left")]),
 )
 @settings(deadline=None)
-def test_the_mirrored_question_has_the_same_answer(
-    azimuth: float, first_px: float, step_px: float, sides: tuple
-) -> None:
+def test_the_mirrored_question_has_the_same_answer(azimuth, first_px, step_px, sides) -> None:
     step_px = float(np.clip(step_px, -first_px / 25, (1736 - first_px) / 25))
     log = crossing(first_px, step_px, images=25)
     here = query(log).ask(NOW, bearing(azimuth), side=sides[0])
@@ -118,9 +114,7 @@ def test_the_mirrored_question_has_the_same_answer(
 
 
 @given(a=AZIMUTHS, b=AZIMUTHS, half_a=st.floats(0.01, 1.5), half_b=st.floats(0.01, 1.5), at=AZIMUTHS)
-def test_the_overlap_is_the_intersection_of_sectors(
-    a: float, b: float, half_a: float, half_b: float, at: float
-) -> None:
+def test_the_overlap_is_the_intersection_of_sectors(a, b, half_a, half_b, at) -> None:
     one, other = Sector(a, half_a), Sector(b, half_b)
     common = one.overlap(other)
     margin = min(abs(abs(wrap_angle(at - s.centre_rad)) - s.half_width_rad) for s in (one, other))
@@ -224,9 +218,7 @@ def test_the_authors_filter() -> None:
     time_s=st.floats(0.0, 12.0),
     max_age_s=st.floats(0.01, 1.0),
 )
-def test_the_latest_frame_is_not_from_the_future_nor_too_old(
-    rate_hz: float, time_s: float, max_age_s: float
-) -> None:
+def test_the_latest_frame_is_not_from_the_future_nor_too_old(rate_hz, time_s, max_age_s) -> None:
     log, times = DetectionLog.at_rate([EMPTY] * 80, rate_hz), np.arange(80) / rate_hz
     index = log.latest(nanoseconds(time_s), nanoseconds(max_age_s))
     shown = [i for i in range(80) if times[i] <= time_s + 0.001]
