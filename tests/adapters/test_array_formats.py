@@ -93,7 +93,6 @@ REFUSED: list[tuple[str | bytes, str]] = [
     ("1,0,0,5\n2,0,0,6\n3,0,0,7\n4,0,0,8\n", "4 numbers per line"),
     ("0,0.05,0,0,1\n1,0,0.05,0,1\n2,-0.05,0,0,1\n", "5 numbers per line"),
     ("0.05 0 -0.05 0\n0 0.05 0 -0.05\n0 0 0 0\n", "write its transpose"),
-    ("\n".join([",".join(["0.1"] * 8)] * 3), "write its transpose"),
     (json.dumps([[0.1, 0, -0.1, 0], [0, 0.1, 0, -0.1], [0] * 4]), "write its transpose"),
     ("50,0,0\n0,50,0\n-50,0,0\n", r"millimetres\? Then a header x_mm"),
     ("5,0,0\n0,5,0\n-5,0,0\n", r"centimetres\? Then a header x_mm"),
@@ -101,7 +100,6 @@ REFUSED: list[tuple[str | bytes, str]] = [
     (json.dumps({"positions_m": PLACES, "positions_mm": PLACES}), "its unit in its name"),
     (json.dumps({"positions_m": PLACES, "unit": "mm"}), "its unit in its name"),
     ("x_in,y_in,z_in\n2,0,0\n0,2,0\n", "columns x, y, z"),
-    ("azimuth,elevation,radius\n0,0,0.05\n90,0,0.05\n", "columns x, y, z"),
     ("mics = [0.05 0 0; 0 0.05 0];\n", "writematrix"),
     (b"MATLAB 5.0 MAT-file\0\0", "writematrix"),
     ('@include "mics.cfg"\ngeneral: { };', "replace @include by the content"),
@@ -122,15 +120,11 @@ REFUSED: list[tuple[str | bytes, str]] = [
     ),
     (BOMB.format(TWO), "entities, which are refused"),
     (EXTERNAL.format(TWO), "entities, which are refused"),
-    ('<!DOCTYPE MicArray SYSTEM "a.dtd"><MicArray/>', "refused"),
     ("", "as XML, JSON or CSV"),
-    ("name,left,right\na,0,0", "columns x, y, z"),
     ("0,0.1,0\n0,0.2\n", "microphone 2: .* finite number as z, got None"),
     ("0,0,0\n0,0,0.5\n", "vertical line"),
-    ("0,-10,0\n0,0,0\n0,10,0\n", "centimetres"),
     ("0,1e-5,0\n0,0,0\n", "expected positions in metres"),
     ("0,0.1,0\n0,0.2,0\n0,0.200000001,0\n", "microphones 2 and 3 1e-09 m apart"),
-    ("0,0.1,0\n0,0.1,0\n", "microphones 1 and 2 0 m apart"),
     ("[[0, 0.1, 0], [0, -0.1]]", "positions"),
     ("[[0, 0.1, 0], [0, -0.1, true]]", "microphone 2: .* finite number as z, got True"),
     ("[[0, 0.1, 0], [0, -0.1, NaN]]", "microphone 2"),
@@ -142,9 +136,7 @@ REFUSED: list[tuple[str | bytes, str]] = [
     (f"<MicArray>{POS.format(1)}</MicArray>", "got 1"),
     (f"<MicArray>{TWO}<pos x='1' y='0'/></MicArray>", "microphone 3: .* finite number as z, got None"),
     (f"<MicArray>{TWO}<pos x='1,5' y='0' z='0'/></MicArray>", "microphone 3: .* finite number as x"),
-    (f"<MicArray>{TWO}<pos x='nan' y='0' z='0'/></MicArray>", "microphone 3"),
     (f"<MicArray>{TWO}<pos x='1' y='inf' z='0'/></MicArray>", "microphone 3"),
-    (f"<MicArray>{TWO}<pos x='390' y='0' z='0'/></MicArray>", "millimetres"),
     (f"<MicArray>{POS.format(1) * 2}</MicArray>", "microphones 1 and 2 0 m apart"),
     ("<MicArray>" + TWO * 513 + "</MicArray>", "got 1026"),
     ("<?xml version='1.0' encoding='klingon'?><MicArray/>", "does not parse"),
@@ -212,10 +204,8 @@ def test_axes_may_be_those_of_the_other_convention(tmp_path: Path) -> None:
 
 def test_the_description_shows_an_array_along_the_vehicle() -> None:
     roof = roof_array_56()
-    assert stance(roof) == (
-        "56 microphones, 0.00 m along x (forward), 0.78 m along y (left), 0.65 m along z (up); "
-        "hears front as back"
-    )
+    extents = "0.00 m along x (forward), 0.78 m along y (left), 0.65 m along z (up)"
+    assert stance(roof) == f"56 microphones, {extents}; hears front as back"
     # The roof array if base_link axes are written into a file of Acoular's form.
     sideways = MicrophoneArray(roof.positions_m[:, [2, 0, 1]] * [1.0, -1.0, 1.0])
     assert "no extent across the vehicle" in stance(sideways)

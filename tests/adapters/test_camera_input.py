@@ -13,12 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stand_ins import Results
 
-from worldstate.adapters.camera.detections import (
-    DetectionFilter,
-    DetectionFrame,
-    DetectionLog,
-    count_boxes,
-)
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, count_boxes
 from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME

@@ -13,11 +13,8 @@ from worldstate.abduction.signature.ensemble import site_reference
 from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings, SiteSignature
 from worldstate.abduction.signature.window_classes import hazard_statistic
-from worldstate.adapters.acoustic import AcousticAdapter
-from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
-from worldstate.adapters.listener import listen_steps, measure_steps
+from worldstate.adapters.files.checkpoint_file import Checkpoint
 from worldstate.adapters.source import ListenSettings, open_source
-from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError
 
 CLASSES = ("front", "left", "none", "right")
@@ -51,63 +48,22 @@ def model():
     return SiteEnsembleClassifier().fit(*made_up_sites(np.random.default_rng(0))).model_
 
 
-@pytest.fixture(scope="module")
-def heard(approach, model):
-    """Frames and source of one approach, its site learned while listening."""
-    source = replace(open_source(approach.folder, array=approach.array_path), model=model)
-    return source, [frame for frame, _ in measure_steps(source)]
-
-
-def test_site_adaptation_has_a_switch(approach, model):
+def test_site_adaptation_has_a_switch_and_may_start_from_a_known_site(approach, model):
     settings = (ListenSettings(site_adaptation=flag) for flag in (True, False))
-    on, off = (open_source(approach.folder, settings=one) for one in settings)
-    assert isinstance(replace(on, model=model).signature(), SiteSignature)
-    assert replace(off, model=model).signature() is model
-    published = object()
+    on, off = (replace(open_source(approach.folder, settings=one), model=model) for one in settings)
+    first, second, published, window = on.signature(), on.signature(), object(), np.exp(model.empty)
+    assert isinstance(first, SiteSignature) and off.signature() is model
     assert replace(on, model=published).signature() is published
     assert ListenSettings(forgetting_s=7.0).site() == SiteEstimateSettings(7.0)
+    unknown = first.evidence(window)
+    assert second.estimate.heard_s == 0.0, "every pass over a source starts without a site"
 
+    def known(site):
+        return replace(on, before=Checkpoint(on.world(), site)).signature()
 
-def test_every_pass_over_a_source_starts_without_a_site(heard):
-    source, frames = heard
-    first, second = source.signature(), source.signature()
-    first.evidence(frames[0].feature)
-    assert second.estimate.heard_s == 0.0
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("cut", [0, 1, 45])
-def test_a_checkpoint_of_the_chain_continues_bit_for_bit(heard, cut, tmp_path):
-    source, frames = heard
-
-    def chain(world, site, part):
-        signature = SiteSignature(source.model, source.settings.site(), estimate=site)
-        adapter = AcousticAdapter(source.array, 48_000.0, signature)
-        states = []
-        for frame in part:
-            measurement = adapter.interpret(frame)
-            world = world.predict_to(measurement.stamp_ns).update(measurement)
-            states.append(world.state)
-        return Checkpoint(world, signature.estimate), states
-
-    start = WorldFilter(context=source.context, policy=source.policy)
-    _, expected = chain(start, None, frames)
-    before, _ = chain(start, None, frames[:cut])
-    save_checkpoint(tmp_path / "c.json", before)
-    assert Checkpoint.from_dict(before.world.to_dict()).site is None  # The filter's part alone
-    again = read_checkpoint(tmp_path / "c.json")
-    _, got = chain(again.world, again.site, frames[cut:])
-    assert [state.to_json() for state in got] == [state.to_json() for state in expected[cut:]]
-    assert len(list(listen_steps(source))) == len(expected)
-
-
-def test_a_known_site_is_used(heard):
-    source, window = heard[0], np.exp(heard[0].model.empty)
-    louder = SiteEstimate(source.model.empty + AZIMUTH, heard_s=300.0)
-    before = Checkpoint(source.world(), louder)
-    assert replace(source, before=before).signature().evidence(window) != source.signature().evidence(window)
+    assert known(SiteEstimate(model.empty + AZIMUTH, heard_s=300.0)).evidence(window) != unknown
     with pytest.raises(InvalidArgumentError, match="estimate"):
-        replace(source, before=Checkpoint(source.world(), SiteEstimate.start(59))).signature()
+        known(SiteEstimate.start(59))
 
 
 def decided(model, gamma, stream):
