@@ -90,11 +90,6 @@ def rows_of(path: Path) -> np.ndarray:
     return np.loadtxt(path, delimiter=",", skiprows=1)
 
 
-def sources_of(path: Path) -> np.ndarray:
-    assert path.read_text().splitlines()[0].endswith(",at_edge,sources")
-    return rows_of(path)[:, -1]
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("number", "name"), list(enumerate(OWN)))
 def test_all_commands_accept_all_arrays(number: int, name: str, tmp_path: Path) -> None:
@@ -105,7 +100,7 @@ def test_all_commands_accept_all_arrays(number: int, name: str, tmp_path: Path) 
     soundfile.write(tmp_path / "a.wav", wave(array, broadside), RATE)
     given = ["--array", str(file)]
     out = tmp_path / "b.csv"
-    assert main(["array", "bearings", str(tmp_path / "a.wav"), *given, "--out", str(out), "--sources"]) == 0
+    assert main(["array", "bearings", str(tmp_path / "a.wav"), *given, "--out", str(out)]) == 0
     rows = rows_of(out)
     assert len(rows) == 4
     assert np.abs(np.abs(rows[:, 1]) - broadside).max() < 8.0
@@ -127,18 +122,6 @@ def test_a_ring_gives_bearings_all_round(tmp_path: Path) -> None:
     found = rows_of(bearings(sound, ring(8, 0.2), tmp_path, *around, "--figure", str(figure)))
     np.testing.assert_allclose(found[:, 1], 150.0, atol=1.0)
     assert figure.is_file()
-
-
-def test_two_sources_are_counted(tmp_path: Path) -> None:
-    array = MicrophoneArray(OWN["sixteen on a board"])
-    sound = wave(array, 40.0) + np.roll(wave(array, -30.0), 999, axis=0)
-    sound += np.random.default_rng(2).normal(0, 0.05, sound.shape)
-    assert sources_of(bearings(sound, OWN["sixteen on a board"], tmp_path, "--sources"))[0] == 2
-
-
-def test_a_dead_microphone_gives_no_sources(tmp_path: Path) -> None:
-    noise = np.random.default_rng(3).normal(0, 0.05, (3 * RATE, 4)) * [1.0, 1.0, 0.0, 1.0]
-    assert not sources_of(bearings(noise, ring(4, 0.2), tmp_path, "--sources")).any()
 
 
 def test_integer_samples_are_scaled_to_full_scale() -> None:

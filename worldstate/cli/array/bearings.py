@@ -4,8 +4,7 @@ Write the bearing of the loudest source every 0.1 s, for any array and without a
 
 --out is a CSV file with the columns time_s (middle of the window), azimuth_deg (left positive), std_deg
 (estimated standard deviation), prominence (peak over median of the spatial spectrum; 1 in silence) and
-at_edge (1 at the edge of the searched sector, beyond which the source may be). --sources adds the number of
-plane waves per second by an information criterion; it includes reflections and is not the number of vehicles.
+at_edge (1 at the edge of the searched sector, beyond which the source may be).
 
 Examples
 --------
@@ -26,9 +25,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_sound_options(parser)
     inputs.add_array_options(parser)
     inputs.add_search_options(parser)
-    parser.add_argument(
-        "--sources", action="store_true", help="estimate the number of plane waves per second"
-    )
     parser.add_argument("--out", type=Path, required=True, metavar="CSV", help="file to write")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw azimuth over time")
 
@@ -39,7 +35,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
     output.check_outputs(arguments, "out", figures=("figure",))
     with inputs.opened_front_end(arguments) as (audio, front_end), progress.sound_bar(audio) as bar:
-        track = bearing_track.track_bearings(audio, front_end, count=arguments.sources, on_second=bar.advance)
+        track = bearing_track.track_bearings(audio, front_end, on_second=bar.advance)
         silent = list(audio.silent_channels)
     bearing_track.write_bearings(track, arguments.out)
     if arguments.figure is not None:

@@ -23,7 +23,7 @@ Examples
   worldstate array check clapping.wav --array mics.xml --heard-from 40
   worldstate array check some.wav --array mics.csv --fit
   worldstate array check some.wav --array mics.csv --fit fitted.csv --also other.wav third.wav
-  worldstate array check some.wav --array mics.xml --duration 600.02 --duration-error 0.001 --json
+  worldstate array check some.wav --array mics.xml --duration 600.02 --json
 """
 
 import argparse
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 _LEAST_WAVE = 0.1
 _UNITS = {"inches": 39.37, "millimetres": 1000.0}
 _USUAL_M = (0.03, 1.5)
+_DURATION_ERROR_S = 0.01  # A stopwatch, or the time stamps of a recorder
 _PRINTED = Path()  # --fit without a file prints the positions
 
 
@@ -57,14 +58,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_array_options(parser)
     inputs.add_search_options(parser)
     add = parser.add_argument
-    add("--duration", type=float, metavar="S", help="length of the recording by another clock, seconds")
-    add(
-        "--duration-error",
-        type=float,
-        default=0.01,
-        metavar="S",
-        help="error of this length (default: %(default)s s)",
-    )
+    told = "length of the recording by another clock, seconds, to 0.01 s"
+    add("--duration", type=float, metavar="S", help=told)
     add("--heard-from", type=float, metavar="DEG", help="azimuth of the only source, left positive")
     told = "estimate positions from the sound, and write them (.csv or .xml)"
     add("--fit", type=Path, nargs="?", const=_PRINTED, metavar="FILE", help=told)
@@ -91,7 +86,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         check_extent(array, front_end.settings.srp_band_hz[1])
         health, check = examine(audio, front_end, arguments.heard_from)
         if arguments.duration is not None:
-            lasted, rate_hz = (arguments.duration, arguments.duration_error), float(audio.sample_rate_hz)
+            lasted, rate_hz = (arguments.duration, _DURATION_ERROR_S), float(audio.sample_rate_hz)
             rate = channel_report.rate_from_duration(audio.frames, *lasted, rate_hz)
             health = replace(health, sample_rate=rate)
         heard = health, audio, array, inputs.stance(array)

@@ -22,7 +22,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from worldstate import adapters, ground, operations
+from worldstate import adapters, operations
 from worldstate.adapters import own_parts
 from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
@@ -39,7 +39,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs.add_detector_option(parser)
     add("--labels", nargs="+", default=["car"], metavar="NAME", help="classes of an ONNX model")
     add("--half-angle", type=float, metavar="DEG", help="half the horizontal view (default: OVAD's camera)")
-    add("--most", type=int, metavar="N", help="use the first N recordings with a vehicle")
     add("--seed", type=int, default=0, help="seed of the noise (default: %(default)s)")
     add("--out", type=Path, required=True, metavar="JSON", help="file to write")
     add("--figure", type=Path, metavar="PNG", help="draw beta over d")
@@ -52,10 +51,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.operations.detectors.miss_rate_measurement import find_videos, write_absence_figure
 
     output.check_outputs(arguments, "out", figures=("figure",))
-    if arguments.most is not None:
-        ground.in_range("--most", arguments.most, 1, np.inf)
     make = own_parts.detector_maker(arguments.detector, tuple(arguments.labels))
-    videos = find_videos(arguments.input, arguments.most)
+    videos = find_videos(arguments.input)
     if arguments.reference is not None and len(videos) > 1:
         raise InvalidArgumentError(f"--reference: expected one video with it, got {len(videos)}")
     scenes = [_scene(arguments, make, *one) for one in videos]

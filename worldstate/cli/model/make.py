@@ -27,7 +27,6 @@ Examples
 
 import argparse
 from dataclasses import asdict
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,8 +58,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     ids = "CSV files with a column ID: recordings to leave out of the labelled windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
-    licence = "licence of the labelled windows, for the card (default: none stated)"
-    add("--licence", default="none stated", metavar="TEXT", help=licence)
     quiet = "recordings without a vehicle, to set the alarm"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
     add("--sounds", type=Path, metavar="FOLDER", help="folder of your own clips")
@@ -68,22 +65,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     command.add_choice(parser, "--ego", "it stands at the junction, or drives up to it", *ONSETS)
     allowed = "allowed false alarms per hour (default: 30, for a moving ego 60)"
     add("--onsets", type=float, metavar="N", help=allowed)
-    add(
-        "--junctions",
-        type=int,
-        default=12,
-        metavar="N",
-        help="junctions for training, per renderer (default: 12)",
-    )
+    told = "junctions for training, per renderer (default: 12)"
+    add("--junctions", type=int, default=12, metavar="N", help=told)
     minutes = "minutes of approaches per junction; other streams and the exam in proportion (default: 7.2)"
     add("--minutes", type=float, default=7.2, metavar="M", help=minutes)
-    add(
-        "--leave-out",
-        nargs="+",
-        default=[],
-        metavar="SITE",
-        help="real junctions to leave out of the training",
-    )
     add("--exam", action=argparse.BooleanOptionalAction, default=True, help="examine the model (default: on)")
     wrong = "examine one junction with a rotated array and with wrong positions as well"
     add("--mounting-errors", action="store_true", help=wrong)
@@ -103,9 +88,10 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     command.check_beside(arguments, exclude="labelled", source="labelled", figure="exam")
     settings, recorded = _settings(arguments), _recorded(arguments)
     reports, lines = dict[str, dict[str, object]](), list[str]()
-    for out, number in zip(outs, count(1)):
-        array, *beside = arrays[number - 1 :] or [frontend.ovad_array()]
-        reports[array.name] = _made(arguments, settings, array, beside, out, recorded, lines)
+    for number, out in enumerate(outs):
+        array, *beside = arrays[number:] or [frontend.ovad_array()]
+        model = _made(arguments, settings, array, beside, out, recorded)
+        reports[array.name] = _examined(arguments, settings, array, beside, out, model, lines)
     report: dict[str, object] = {"models": reports} if len(arrays) > 1 else next(iter(reports.values()))
     told = {name: one for name, one in report.items() if name != "real_figures"}
     told = {"out": str(arguments.out)} if len(arrays) > 1 else told
@@ -143,21 +129,18 @@ def _made(
     beside: "list[frontend.MicrophoneArray]",
     out: Path,
     recorded: "RecordedClips | None",
-    lines: list[str],
-) -> dict[str, object]:
-    """Make and examine the model of one array; return its report."""
-    from worldstate.commissioning import commission, heard_stream, stream_exam
+) -> "adapters.Model":
+    """Make and write the model of one array."""
+    from worldstate.commissioning import commission, heard_stream
 
-    folder = arguments.streams or arguments.out.with_suffix(".streams")
     minutes = sum(one.minutes for one in heard_stream.learned_streams(settings))
     with progress.progress_bar(f"making {out.name}", minutes + commission.learning_minutes(settings)) as bar:
         model = commission.commission(
             array,
             settings,
-            folder,
+            _streams(arguments),
             table=_labelled(arguments),
             source=arguments.source or getattr(arguments.labelled, "name", ""),
-            licence=arguments.licence,
             excluded_lists=[path.name for path in arguments.exclude],
             quiet=arguments.quiet,
             recorded=recorded,
@@ -166,6 +149,22 @@ def _made(
             on_step=bar.go_on,
         )
     adapters.save_model(out, model)
+    return model
+
+
+def _examined(
+    arguments: argparse.Namespace,
+    settings: "CommissionSettings",
+    array: "frontend.MicrophoneArray",
+    beside: "list[frontend.MicrophoneArray]",
+    out: Path,
+    model: "adapters.Model",
+    lines: list[str],
+) -> dict[str, object]:
+    """Examine a model; return its report, and add its lines."""
+    from worldstate.commissioning import commission, heard_stream, stream_exam
+
+    folder = _streams(arguments)
     report: dict[str, object] = {"out": str(out), "fit_for_use": model.provenance.fit_for_use}
     report["real_figures"] = [asdict(one) for one in model.provenance.real]
     lines += [one.sentence for one in model.provenance.real if one.sentence not in lines]
@@ -187,6 +186,12 @@ def _made(
         report["mounting"] = mounted
         lines += ["", *stream_exam.mounting_lines(mounted)]
     return report
+
+
+def _streams(arguments: argparse.Namespace) -> Path:
+    """Return the folder of processed streams."""
+    folder: Path = arguments.streams or arguments.out.with_suffix(".streams")
+    return folder
 
 
 def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":
@@ -225,7 +230,6 @@ def _settings(arguments: argparse.Namespace) -> "CommissionSettings":
         exam_minutes=minutes / 0.3,
         onsets_per_hour=ONSETS[arguments.ego] if arguments.onsets is None else arguments.onsets,
         seed=arguments.seed,
-        leave_out=tuple(arguments.leave_out),
         moving_ego=arguments.ego == "moving",
     )
     return quick_settings(settings) if arguments.quick else settings

@@ -32,14 +32,8 @@ _ROWS = {
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add = parser.add_argument
-    add(
-        "file",
-        type=Path,
-        nargs="?",
-        metavar="FILE",
-        help="model file, or the name of a shipped model (default: the first one)",
-    )
+    told = "model file, or the name of a shipped model (default: the first one)"
+    parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help=told)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:

@@ -43,7 +43,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--alpha", type=float, nargs="+", default=[0.01, 0.02, 0.05], metavar="A", help=budgets)
     own = "default false alarms per hour, for a corpus (default: the model's)"
     add("--budget", type=float, metavar="ONSETS", help=own)
-    add("--sustain-hops", type=int, default=3, help="k of the sustained rule (default: 3)")
     add("--save-streams", type=Path, metavar="NPZ", help="save the processed streams for a later run")
 
 
@@ -54,10 +53,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.operations.recordings.hop_table import save_tables
 
     output.check_outputs(arguments, "out", "save_streams")
-    settings = operations.CueingSettings(
-        alphas=tuple(arguments.alpha),
-        sustain_hops=arguments.sustain_hops,
-    )
+    settings = operations.CueingSettings(alphas=tuple(arguments.alpha))
     array = inputs.given_array(arguments)
     model = adapters.read_model(arguments.model, array=array)
     streams = progress.read_streams(arguments.inputs, array, arguments.model)

@@ -268,7 +268,7 @@ def reference_by(detector: Detector, video: Video) -> DetectionLog:
     return DetectionLog.at_rate(found, video.frame_rate_hz, source=str(video.path))
 
 
-def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | None]]:
+def find_videos(path: Path) -> list[tuple[Path, Path | None]]:
     """Return videos with the files of their reference boxes, None for a video without one."""
     # In a data set, the recordings with a vehicle and with both files are used.
     if path.is_file():
@@ -281,7 +281,7 @@ def find_videos(path: Path, most: int | None = None) -> list[tuple[Path, Path | 
     found = [_of_recording(r) for r in approaches if (r.path / VIDEO_NAME).is_file() and r.detections_path]
     if not found:
         raise InputFileError(path, f"expected recordings of a vehicle with {VIDEO_NAME} and detections")
-    return found[:most]
+    return found
 
 
 def _of_recording(recording: Recording) -> tuple[Path, Path | None]:
