@@ -37,7 +37,6 @@ from worldstate.adapters.files.context_file import read_context
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog, read_odometry
 from worldstate.adapters.ros.bag_input import (
-    BagInput,
     BagSound,
     is_bag,
     needed_array,
@@ -469,18 +468,20 @@ def open_source(
     """
     sound, named = sound_of(path, topics or {})
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
-    bag = _beside(sound, topics or {}) if isinstance(sound, BagSound) and sound is not path else None
+    bag = sound if isinstance(sound, BagSound) and sound is not path else None
+    boxes, ego = (None, None) if bag is None else _beside(bag, topics or {})
     place, sensors = _place(context), SourceSensors.of(array, car, camera)
     asked = sensors.boxes_in(settings_with(settings, budget, alpha, uncalibrated), detector)
-    drive = _read(odometry or sensors.car.odometry, read_odometry) or (None if bag is None else bag.ego)
+    drive = _read(odometry or sensors.car.odometry, read_odometry)
+    drive = ego if drive is None else drive
     driven = moving_ego or (drive is not None and drive.moves)
     moves = bool(driven or (recording and recording.moving_ego) or place.ego_speed_mps)
-    given = sensors.car.array if bag is None else needed_array(bag.sound, sensors.car.array or named)
+    given = sensors.car.array if bag is None else needed_array(bag, sensors.car.array or named)
     chosen = model or sensors.car.model
     if chosen is None and driven:
         _LOG.warning("the model of a moving ego vehicle is used, because odometry is given")
     heard_by, known = _array_and_model(sound, given, chosen, asked, moves)
-    several, one = sensors.reported(detections, detector, None if bag is None else bag.detections)
+    several, one = sensors.reported(detections, detector, boxes)
     if sensors.camera is None and (one, detector) != (None, None):
         check_mounting(heard_by)
     measured = [other_modality(name, file) for name, file in sensors.car.measurements.items()]
@@ -533,7 +534,7 @@ def raw_pcm(name: str, form: str, stream: BinaryIO, path: str = "/dev/stdin") ->
     return RawPcm(stream, int(rate), int(channels), cast("Encoding", encoding or "s16"), path)
 
 
-def _beside(sound: BagSound, topics: Mapping[str, str]) -> BagInput:
+def _beside(sound: BagSound, topics: Mapping[str, str]) -> tuple[DetectionLog | None, OdometryLog | None]:
     return read_beside(sound, **{name: topic for name, topic in topics.items() if name != "audio"})
 
 

@@ -2,9 +2,11 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
+from worldstate.adapters.ros.bag_input import read_beside, read_sound
 from worldstate.adapters.ros.bag_writer import bag_writer
 from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
 
@@ -17,6 +19,12 @@ def bag_of(path: Path, messages: Iterable[Message], storage: str = "mcap") -> Pa
         for one in messages:
             write(*one)
     return path
+
+
+def read_bag(path: Path) -> SimpleNamespace:
+    sound, array = read_sound(path)
+    detections, ego = read_beside(sound)
+    return SimpleNamespace(sound=sound, array=array, detections=detections, ego=ego)
 
 
 def sound_of(n_samples: int) -> np.ndarray:

@@ -457,17 +457,13 @@ class PortAudioInput:
 
     def start(self, into: BoundedChannel[SoundBlock], /) -> None:
         """Open the device and start to record."""
-
-        def on_block(samples: Float32Array, frames: int, times: Any, status: Any) -> None:
-            into.put(self._block(samples, times, status))
-
         self._stream = self._sounddevice.InputStream(
             samplerate=self.sample_rate_hz,
             blocksize=block_samples(self.sample_rate_hz),
             device=self._device,
             channels=self.channels,
             dtype="float32",
-            callback=on_block,
+            callback=lambda samples, frames, times, status: into.put(self._block(samples, times, status)),
         )
         self._stream.start()
 

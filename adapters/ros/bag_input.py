@@ -63,9 +63,10 @@ class BagReader:
     path: Path
     reader: Any  # The reader of rosbags
 
-    def count(self, topic: str) -> int:
-        """Return the number of messages on a topic, from the bag's metadata."""
-        return sum(int(one.msgcount) for one in self.reader.connections if one.topic == topic)
+    def has(self, topic: str, kind: str) -> bool:
+        """Return whether there are messages of a type on a topic, from the bag's metadata."""
+        every = self.reader.connections
+        return any(one.topic == topic and one.msgtype == kind and one.msgcount for one in every)
 
     def topic(self, option: str, given: str | None, *kinds: str) -> str | None:
         """Return the topic with messages of one of these types; None if there is none.
@@ -366,16 +367,6 @@ def _bytes_of(pcm: sound_file.RawPcm, message: Any) -> bytes:
     return bytes(data.reshape(pcm.channels, -1).T.tobytes() if layout == "planar" else data.tobytes())
 
 
-@dataclass(frozen=True, slots=True)
-class BagInput:
-    """The contents of a bag; missing parts are None."""
-
-    sound: BagSound
-    array: MicrophoneArray | None
-    detections: DetectionLog | None
-    ego: OdometryLog | None
-
-
 def read_sound(
     path: Path, topic: str | None = None, stated: sound_file.RawPcm | None = None
 ) -> tuple[BagSound, MicrophoneArray | None]:
@@ -384,26 +375,21 @@ def read_sound(
         return sound_of_bag(bag, topic, stated), _array(bag)
 
 
-def read_bag(
-    path: Path, *, audio: str | None = None, detections: str | None = None, odometry: str | None = None
-) -> BagInput:
-    """Read all of a bag except its samples, from the given topics or the only ones of their types.
+def read_beside(
+    sound: BagSound, *, detections: str | None = None, odometry: str | None = None
+) -> tuple[DetectionLog | None, OdometryLog | None]:
+    """Return detections and odometry of a bag, from the given topics or the only ones of their types.
 
     Raises
     ------
     InputFileError
-        If the bag is damaged, has no sound, several topics fit, or a message contains impossible values.
+        If the bag is damaged, several topics fit, or a message contains impossible values.
     """
-    return read_beside(read_sound(path, audio)[0], detections=detections, odometry=odometry)
-
-
-def read_beside(sound: BagSound, *, detections: str | None = None, odometry: str | None = None) -> BagInput:
-    """Read the contents of a bag other than its sound."""
     with open_bag(sound.path) as bag, refused_as_file(sound.path):
         seen = bag.topic("--topic detections=", detections, types.DETECTIONS)
         driven = bag.topic("--topic odometry=", odometry, types.ODOMETRY)
         boxes = None if seen is None else _detections(bag, seen, sound)
-        return BagInput(sound, _array(bag), boxes, None if driven is None else _ego(bag, driven, sound))
+        return boxes, None if driven is None else _ego(bag, driven, sound)
 
 
 def needed_array(sound: BagSound, array: MicrophoneArray | None) -> MicrophoneArray:
@@ -445,7 +431,7 @@ def _in_base_link(bag: BagReader, sound: BagSound, points_m: FloatArray) -> Floa
 def _static_transforms(bag: BagReader) -> dict[str, tuple[str, Any]]:
     """Return the parent of every frame and the last transform to it."""
     found: dict[str, tuple[str, Any]] = {}
-    if not bag.count(STATIC_TOPIC) or bag.kind_of(STATIC_TOPIC) != types.TRANSFORMS:
+    if not bag.has(STATIC_TOPIC, types.TRANSFORMS):
         return found
     for _, message in _few(bag, STATIC_TOPIC):
         for one in message.transforms:
@@ -556,9 +542,8 @@ def _timed(
 def detection_frame(found: Any) -> DetectionFrame:
     """Return the boxes of an image, with the same checks as for a file."""
     best = [_best(one.results) for one in found]
-    labels, scores = [label for label, _ in best], [score for _, score in best]
-    boxes = [_box(one.bbox) for one in found]
-    return frame_of({"boxes": boxes, "scores": scores, "classes_str": labels}, "detections")
+    told = {"scores": [score for _, score in best], "classes_str": [label for label, _ in best]}
+    return frame_of(told | {"boxes": [_box(one.bbox) for one in found]}, "detections")
 
 
 def _box(box: Any) -> tuple[float, float, float, float]:

@@ -152,17 +152,15 @@ def _frames(array: MicrophoneArray, camera: PinholeCamera | None, stamp_ns: int)
     placed = {MICROPHONES_FRAME: (array.positions_m.mean(axis=0).tolist(), (0.0, 0.0, 0.0))}
     if camera is not None:
         placed[CAMERA_FRAME] = camera.position_m, (camera.yaw_rad, -camera.pitch_rad, camera.roll_rad)
-    return [
-        {
-            "header": header(stamp_ns),
-            "child_frame_id": frame,
-            "transform": {
-                "translation": dict(zip("xyz", at_m, strict=True)),
-                "rotation": dict(zip("xyzw", Rotation.from_euler("ZYX", turn).as_quat(), strict=True)),
-            },
+    found = []
+    for frame, (at_m, turn) in placed.items():
+        quaternion = Rotation.from_euler("ZYX", turn).as_quat()
+        pose = {
+            "translation": dict(zip("xyz", at_m, strict=True)),
+            "rotation": dict(zip("xyzw", quaternion, strict=True)),
         }
-        for frame, (at_m, turn) in placed.items()
-    ]
+        found.append({"header": header(stamp_ns), "child_frame_id": frame, "transform": pose})
+    return found
 
 
 def _array(array: MicrophoneArray, stamp_ns: int) -> dict[str, Any]:
@@ -215,6 +213,7 @@ MARKERS_TOPIC, SNAPSHOT_TOPIC = "/worldstate/markers", "/worldstate/snapshot"
 # Constants of visualization_msgs/Marker.
 ARROW, CUBE, LINE_STRIP, LABEL, TRIANGLE_LIST = 0, 1, 4, 9, 11
 ADD, DELETE_ALL = 0, 3
+_CAUSES = "hidden", "visible", "none"
 
 
 @contextmanager
@@ -237,7 +236,7 @@ def state_bag(
 def bag_snapshot_lines(path: Path) -> Iterator[str]:
     """Yield the snapshots of a bag as the JSON text that was written."""
     with open_bag(path) as bag:
-        if bag.count(SNAPSHOT_TOPIC) and bag.kind_of(SNAPSHOT_TOPIC) == types.TEXT:
+        if bag.has(SNAPSHOT_TOPIC, types.TEXT):
             yield from (message.data for _, message in bag.messages(SNAPSHOT_TOPIC))
 
 
@@ -259,20 +258,16 @@ def risk_advisories(state: WorldState) -> dict[str, Any]:
 
 
 def _advisory(cue: RiskCue) -> dict[str, Any]:
-    out = cue.advisory
-    within, unknown = cue.within or {}, math.nan
-    causes = cue.hypotheses
-    return {
+    out, within, causes = cue.advisory, cue.within or {}, cue.hypotheses
+    shares = {name: math.nan if causes is None else getattr(causes, name) for name in _CAUSES}
+    return shares | {
         "direction": cue.direction or "",
         "usable": cue.usable,
         "why_not": list(cue.why_not),
         "azimuth": cue.azimuth_rad,
         "azimuth_std": cue.azimuth_std_rad,
-        "risk": unknown if cue.risk is None else cue.risk,
-        "confidence": unknown if cue.confidence is None else cue.confidence,
-        "hidden": unknown if causes is None else causes.hidden,
-        "visible": unknown if causes is None else causes.visible,
-        "none": unknown if causes is None else causes.none,
+        "risk": math.nan if cue.risk is None else cue.risk,
+        "confidence": math.nan if cue.confidence is None else cue.confidence,
         "raised": out is not None,
         "since": time_of(0 if out is None else out.since_ns),
         "valid_until": time_of(0 if out is None else out.valid_until_ns),

@@ -36,7 +36,7 @@ from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.context_file import read_context
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.files.odometry_file import read_odometry
-from worldstate.adapters.ros.bag_input import read_bag
+from worldstate.adapters.ros.bag_input import read_sound
 from worldstate.adapters.state_log import read_log, read_state_near
 from worldstate.adapters.vehicle.car_file import read_camera_setup, read_car
 from worldstate.ground.errors import InputFileError, WorldstateError
@@ -55,7 +55,7 @@ def sound(path: Path) -> None:
 
 
 def bag(path: Path) -> None:
-    with open_sound(read_bag(path).sound) as audio:
+    with open_sound(read_sound(path)[0]) as audio:
         assert sum(map(len, audio.blocks())) >= RATE_HZ
 
 

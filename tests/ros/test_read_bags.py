@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from bag_messages import CHANNELS, RATE_HZ, bag_of, block, blocks, info, moved, sound_of
+from bag_messages import CHANNELS, RATE_HZ, bag_of, block, blocks, info, moved, read_bag, sound_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -20,7 +20,7 @@ from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.odometry_file import OdometryLog
 from worldstate.adapters.listener import listen_steps
-from worldstate.adapters.ros.bag_input import needed_array, read_bag
+from worldstate.adapters.ros.bag_input import needed_array
 from worldstate.adapters.ros.message_types import header
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main

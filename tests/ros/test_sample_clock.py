@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_messages import Message, bag_of, block, box, image, info, moved, pcm, sound_of
+from bag_messages import Message, bag_of, block, box, image, info, moved, pcm, read_bag, sound_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.adapters.audio.sound_file import RawPcm, open_sound
-from worldstate.adapters.ros.bag_input import is_bag, read_bag, read_sound
+from worldstate.adapters.ros.bag_input import is_bag, read_sound
 from worldstate.adapters.ros.sample_clock import begins_again, contradiction, lost_before
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError

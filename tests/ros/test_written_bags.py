@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from bag_messages import read_bag
 from scipy.spatial.transform import Rotation
 from scripted_states import scripted_states
 
@@ -20,7 +21,6 @@ from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.export.other_stacks import autoware_objects
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.ros import message_types
-from worldstate.adapters.ros.bag_input import read_bag
 from worldstate.adapters.ros.bag_writer import bag_writer, state_bag
 from worldstate.adapters.ros.message_types import AUDIO, header
 from worldstate.cli.main import main

@@ -28,12 +28,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("states", type=Path, metavar="LOG", help="log of `worldstate run`, by --out or --export mcap")
-    add(
-        "--time",
-        type=float,
-        metavar="S",
-        help="seconds on the clock of the states (default: the first advisory)",
-    )
+    told = "seconds on the clock of the states (default: the first advisory)"
+    add("--time", type=float, metavar="S", help=told)
     add("--side", help="one side only, such as left (default: every side)")
 
 

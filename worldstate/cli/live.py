@@ -55,8 +55,7 @@ if TYPE_CHECKING:
     from worldstate.adapters.live.live_sound import LiveSound, SoundFeed
     from worldstate.adapters.source import SourceSensors
 
-    HandIn = Callable[[Listener], int]
-    Losses = Callable[[], dict[str, object]]
+    Show = Callable[[LiveStep], None]
 
 Port = TypeVar("Port", bound="DatagramSocket[Any]")
 
@@ -127,10 +126,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         source = replace(source, sound=sound)
         sound.start_ns = source.start_ns
         ports = _Ports(_trust(arguments, source.before), sound, opened)
-        source, look, looks_lost = _with_cameras(arguments, sensors, source, ports)
-        tell, odometry_lost = _odometry(arguments, ports)
-        steps = live_steps(source, look, tell)
-        figures = _listen(arguments, source, ports, steps) | looks_lost() | odometry_lost()
+        source = _with_cameras(arguments, sensors, source, ports)
+        _open_odometry(arguments, ports)
+        figures = _listen(arguments, source, ports, live_steps(source, *ports.hand_in))
+        for losses in ports.losses:
+            figures |= losses()
         return output.CommandResult(figures | {"array": inputs.stance(source.array)})
 
 
@@ -184,12 +184,14 @@ def _played(arguments: argparse.Namespace, recorded: "adapters.Source") -> "Soun
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Ports:
-    """Open ports of detectors and odometry; `opened` closes them."""
+    """Open ports of detectors and odometry, and a camera of this machine; `opened` closes them."""
 
     trust: "Trust"
     sound: "LiveSound"
     opened: ExitStack
     sockets: "list[DatagramSocket[Any]]" = field(default_factory=list)
+    hand_in: "list[Callable[[Listener], int]]" = field(default_factory=list)  # Pass data to the listener
+    losses: list[Callable[[], dict[str, object]]] = field(default_factory=list)  # Figures for the report
 
     def open(self, kind: "Callable[..., Port]", address: str, *camera: str) -> "Port":
         """Open a port; `camera` is the name of its camera if there are several."""
@@ -197,6 +199,16 @@ class _Ports:
         self.opened.enter_context(port)
         self.sockets.append(port)
         return port
+
+    def report(self, sockets: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> None:
+        """Add the losses of some sockets to the report."""
+        self.losses.append(
+            lambda: {
+                f"{name}_dropped": sum(one.dropped for one in sockets),
+                f"{name}_refused": sum(one.refused for one in sockets),
+                f"last_{last}refusal": next((one.problem for one in sockets if one.problem), None),
+            }
+        )
 
     def kept(self, last: "adapters.Step") -> "adapters.Checkpoint":
         """Return the checkpoint of a hop, with the last number of each port."""
@@ -210,8 +222,8 @@ class _Ports:
 
 def _with_cameras(
     arguments: argparse.Namespace, sensors: "SourceSensors", source: "adapters.Source", ports: _Ports
-) -> "tuple[adapters.Source, HandIn, Losses]":
-    """Return the source with its cameras, a function that passes their detections on, and their losses."""
+) -> "adapters.Source":
+    """Return the source with its cameras."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS, SENSOR
     from worldstate.adapters.live.live_sensors import DetectionSocket
     from worldstate.adapters.source import with_cameras
@@ -224,19 +236,23 @@ def _with_cameras(
             raise InvalidArgumentError("--detections: expected those of several cameras without --camera")
         sockets = {name: ports.open(DetectionSocket, address, name) for name, address in given.items()}
         source = with_cameras(source, sensors.car, dict.fromkeys(given, NO_LOOKS))
+    elif given is None:
+        return source
     else:
-        sockets = {} if given is None else {SENSOR: ports.open(DetectionSocket, given)}
-        source = replace(source, detections=NO_LOOKS) if sockets else source
+        sockets = {SENSOR: ports.open(DetectionSocket, given)}
+        source = replace(source, detections=NO_LOOKS)
 
     def hand_in(listener: "Listener") -> int:
         return sum(one.deliver(partial(listener.look, camera=name)) for name, one in sockets.items())
 
-    return source, hand_in, _losses(sockets.values(), "detections")
+    ports.hand_in.append(hand_in)
+    ports.report(sockets.values(), "detections")
+    return source
 
 
 def _with_device(
     arguments: argparse.Namespace, sensors: "SourceSensors", source: "adapters.Source", ports: _Ports
-) -> "tuple[adapters.Source, HandIn, Losses]":
+) -> "adapters.Source":
     """Return the source with a camera of this machine."""
     from worldstate.adapters.camera.vision_query import NO_LOOKS
     from worldstate.adapters.live.live_sensors import CameraFeed, ImageLooks, image_channel
@@ -246,27 +262,24 @@ def _with_device(
     size = source.camera.width_px, source.camera.height_px
     looks = ImageLooks(images, detector, ports.sound.stamp_ns, size, source.miss_rates)
     ports.opened.enter_context(CameraFeed(arguments.camera_device, images))
-    seen = replace(source, detections=NO_LOOKS, degradation=looks.degradation)
 
     def losses() -> dict[str, object]:
         refused, last = looks.refused, looks.problem or None
         return {"images_dropped": images.dropped, "images_refused": refused, "last_refusal": last}
 
-    return seen, lambda to: looks.deliver(to.look), losses
+    ports.hand_in.append(lambda to: looks.deliver(to.look))
+    ports.losses.append(losses)
+    return replace(source, detections=NO_LOOKS, degradation=looks.degradation)
 
 
-def _odometry(arguments: argparse.Namespace, ports: _Ports) -> "tuple[HandIn, Losses]":
-    """Return a function that passes the odometry on, and its losses."""
+def _open_odometry(arguments: argparse.Namespace, ports: _Ports) -> None:
     from worldstate.adapters.live.live_sensors import OdometrySocket
 
     if arguments.odometry is None:
-        return lambda to: 0, dict
+        return
     told = ports.open(OdometrySocket, arguments.odometry)
-
-    def hand_in(listener: "Listener") -> int:
-        return told.deliver(lambda stamp_ns, record: listener.add(record.at(stamp_ns)))
-
-    return hand_in, _losses([told], "odometry", "odometry_")
+    ports.hand_in.append(lambda to: told.deliver(lambda stamp_ns, record: to.add(record.at(stamp_ns))))
+    ports.report([told], "odometry", "odometry_")
 
 
 def _trust(arguments: argparse.Namespace, before: "adapters.Checkpoint | None" = None) -> "Trust":
@@ -284,16 +297,6 @@ def _trust(arguments: argparse.Namespace, before: "adapters.Checkpoint | None" =
     return Trust(allow, key, {} if before is None or before.ports is None else before.ports.last)
 
 
-def _losses(told: "Collection[DatagramSocket[Any]]", name: str, last: str = "") -> "Losses":
-    if not told:
-        return dict
-    return lambda: {
-        f"{name}_dropped": sum(one.dropped for one in told),
-        f"{name}_refused": sum(one.refused for one in told),
-        f"last_{last}refusal": next((one.problem for one in told if one.problem), None),
-    }
-
-
 def _listen(
     arguments: argparse.Namespace,
     source: "adapters.Source",
@@ -306,15 +309,13 @@ def _listen(
     from worldstate.operations.recordings.recording_report import WarningMeter
 
     warnings, latency, cost = WarningMeter(source.t0_s, source.hazard_free), LatencyMeter(), CostMeter()
-    notice, sound = _loss_notices(), ports.sound
+    notice, shown, sound = _loss_notices(), _shown(arguments, ports.opened), ports.sound
     start_s = ground.seconds(source.start_ns)
     longest_s = math.inf if arguments.duration is None else arguments.duration
     with (
         _kept(arguments, ports) as keep,
         line_writer(arguments.out, partial(GrowingFile, most_bytes=exports.most_bytes(arguments))) as write,
         exports.exported_hops(arguments, source, live=True) as export,
-        _view(arguments) as show,
-        _web(arguments) as show_page,
         command.stopped_by_signals(sound.close),
     ):
         for live in steps:
@@ -322,8 +323,8 @@ def _listen(
             export(live.step)
             warnings.update(live.step.state)
             latency.add(live.latency_s)
-            show(live)
-            show_page(live)
+            for show in shown:
+                show(live)
             notice(live)
             keep(live.step)
             if ground.seconds(live.step.state.stamp_ns) - start_s >= longest_s:
@@ -372,32 +373,23 @@ def _kept(arguments: argparse.Namespace, ports: _Ports) -> "Iterator[Callable[[a
     save()
 
 
-@contextmanager
-def _view(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
-    """Yield a function that shows a hop in the terminal; by default only if standard error is one."""
-    if not (progress.can_draw() if arguments.view is None else arguments.view):
-        yield lambda live: None
-        return
-    from worldstate.cli.common.live_view import live_view
+def _shown(arguments: argparse.Namespace, opened: ExitStack) -> "list[Show]":
+    """Return functions that show a hop: in the terminal, by default if there is one, and by --web."""
+    found: list[Show] = []
+    if progress.can_draw() if arguments.view is None else arguments.view:
+        from worldstate.cli.common.live_view import live_view
 
-    with live_view() as show:
-        yield show
+        found.append(opened.enter_context(live_view()))
+    if arguments.web is not None:
+        from worldstate.operations.viewing.live_page import LivePage
 
-
-@contextmanager
-def _web(arguments: argparse.Namespace) -> "Iterator[Callable[[LiveStep], None]]":
-    """Yield a function that passes a hop on to the page of --web."""
-    if arguments.web is None:
-        yield lambda live: None
-        return
-    from worldstate.operations.viewing.live_page import LivePage
-
-    with LivePage(arguments.web) as page:
+        page = opened.enter_context(LivePage(arguments.web))
         output.say(f"open {page.url}")
-        yield page.show
+        found.append(page.show)
+    return found
 
 
-def _loss_notices() -> "Callable[[LiveStep], None]":
+def _loss_notices() -> "Show":
     """Return a function that prints a notice of lost sound, at most once per second."""
     said, said_ns = 0, -SAID_EVERY_NS
 

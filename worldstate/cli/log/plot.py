@@ -26,12 +26,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, metavar="PNG", help="draw the run over time")
     add("--recording", type=Path, action="append", metavar="WAV", help="sound of the run, for --out")
     add("--birds-eye", type=Path, metavar="PNG", help="draw the snapshot nearest to --time from above")
-    add(
-        "--time",
-        type=float,
-        metavar="S",
-        help="seconds on the clock of the states (default: the largest risk)",
-    )
+    told = "seconds on the clock of the states (default: the largest risk)"
+    add("--time", type=float, metavar="S", help=told)
     add("--animate", type=Path, metavar="GIF", help="draw every snapshot from above")
     parser.set_defaults(topic=[])
     inputs.add_array_options(parser)

@@ -40,13 +40,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     with (
         line_writer(arguments.out) as write,
         exports.open_exports(arguments, crossing_m=crossing_m) as opened,
-        progress.progress_bar(f"reading {arguments.log.name}", None) as bar,
     ):
-        for line, state in read_log(arguments.log):
+        for line, state in progress.track(read_log(arguments.log), f"reading {arguments.log.name}"):
             write(line)
             opened.state(state)
             meter.update(state)
-            bar.advance()
     summary = {
         "states": meter.states,
         "first_s": ground.seconds(meter.first_ns),

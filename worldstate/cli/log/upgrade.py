@@ -12,7 +12,9 @@ Examples
 """
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from worldstate.cli.common import output, progress
 from worldstate.ground import InputFileError
@@ -20,10 +22,9 @@ from worldstate.ground import InputFileError
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("log", type=Path, metavar="IN", help="log of an earlier version")
-    parser.add_argument(
-        "out", type=Path, metavar="OUT", help="log to write: JSON lines, or MCAP for an MCAP log"
-    )
+    add = parser.add_argument
+    add("log", type=Path, metavar="IN", help="log of an earlier version")
+    add("out", type=Path, metavar="OUT", help="log to write: JSON lines, or MCAP for an MCAP log")
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
@@ -36,17 +37,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     is_mcap, states = is_own_mcap(arguments.log), 0
     if is_mcap != (arguments.out.suffix.lower() == ".mcap"):
         raise InputFileError(arguments.out, "expected a name ending in .mcap exactly if IN is an MCAP file")
-    with progress.progress_bar(f"reading {arguments.log.name}", None) as bar:
-        if is_mcap:
-            with mcap_file(arguments.out) as write_message:
-                for message in upgraded_messages(arguments.log):
-                    write_message(message)
-                    states += message.topic == SNAPSHOT_TOPIC
-                    bar.advance(message.topic == SNAPSHOT_TOPIC)
-        else:
-            with line_writer(arguments.out) as write:
-                for line, _ in read_log(arguments.log):
-                    write(line)
-                    states += 1
-                    bar.advance()
+    records: Iterator[Any] = upgraded_messages(arguments.log) if is_mcap else read_log(arguments.log)
+    with (mcap_file if is_mcap else line_writer)(arguments.out) as write:
+        for record in progress.track(records, f"reading {arguments.log.name}"):
+            write(record if is_mcap else record[0])
+            states += not is_mcap or record.topic == SNAPSHOT_TOPIC
     return output.CommandResult({"states": states, "written": str(arguments.out)})

@@ -28,13 +28,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("log", type=Path, metavar="LOG", help="log of `worldstate run`, by --out or --export mcap")
     add("--out", type=Path, metavar="HTML", help="page to write (default: LOG with the suffix .html)")
-    add(
-        "--between",
-        type=float,
-        nargs=2,
-        metavar="S",
-        help="first and last time, seconds on the clock of the states",
-    )
+    told = "first and last time, seconds on the clock of the states"
+    add("--between", type=float, nargs=2, metavar="S", help=told)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:

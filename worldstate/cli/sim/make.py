@@ -65,12 +65,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="D", help="folder of the data set")
-    add(
-        "--static",
-        type=int,
-        metavar="N",
-        help="recordings with a standing ego (default: 4, 0 with --dynamic)",
-    )
+    told = "recordings with a standing ego (default: 4, 0 with --dynamic)"
+    add("--static", type=int, metavar="N", help=told)
     add("--dynamic", type=int, default=0, metavar="N", help="recordings with a moving ego (default: 0)")
     command.add_choice(parser, "--scene", "what hides the vehicle", JUNCTION, *simulation.PLACES, "all")
     command.add_choice(parser, "--kind", "vehicle", *simulation.KINDS)
@@ -120,11 +116,9 @@ def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
 
     given = [f"--{name}" for name, usual in OF_RECORDINGS.items() if getattr(arguments, name) != usual]
     if given:
-        raise InvalidArgumentError(
-            f"--minutes: expected without {', '.join(given)}, which apply to recordings only"
-        )
+        problem = f"expected without {', '.join(given)}, which apply to recordings only"
+        raise InvalidArgumentError(f"--minutes: {problem}")
     check_extra("matplotlib")
-    arguments.traffic = arguments.traffic or "calm"
     settings = _stream_settings(arguments)
     with progress.progress_bar("simulating", settings.duration_s) as bar:
         array, jobs = inputs.given_array(arguments), arguments.jobs
@@ -137,7 +131,7 @@ def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
         "hazards": sum(one.hazard for one in stream.vehicles),
         "site": settings.site.name,
         "sample_rate_hz": settings.sample_rate_hz,
-        **{name: getattr(arguments, name) for name in ("traffic", "preset", "seed")},
+        **{"traffic": arguments.traffic or "calm", "preset": arguments.preset, "seed": settings.seed},
     }
     return output.CommandResult(summary, lines=["", f"see {stream.folder / FIGURE_NAME}"])
 
@@ -149,22 +143,17 @@ def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
     from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 
-    (kinds, folder), traffic = _sounds(arguments.sounds), traffic_named(arguments.traffic)
+    (kinds, folder), traffic = _sounds(arguments.sounds), traffic_named(arguments.traffic or "calm")
     rate_hz, band = SAMPLE_RATE_HZ, arguments.bandwidth
     if band is not None:
         rate_hz = rate_for(ground.in_range("--bandwidth", band, *BANDWIDTHS_HZ))
+    sounds = {**traffic.sounds, **{kind: PER_HOUR for kind in kinds if kind not in SIGNALS}}
+    signals = {kind: SIGNAL_SHARE for kind in kinds if kind in SIGNALS}
     return StreamSettings(
         site=simulation.site(arguments.site or simulation.SITES[0]),
         minutes=arguments.minutes,
         seed=arguments.seed,
-        traffic=replace(
-            traffic,
-            sounds={
-                **traffic.sounds,
-                **dict.fromkeys((one for one in kinds if one not in SIGNALS), PER_HOUR),
-            },
-            signals=dict.fromkeys((kind for kind in kinds if kind in SIGNALS), SIGNAL_SHARE),
-        ),
+        traffic=replace(traffic, sounds=sounds, signals=signals),
         preset=replace(simulation.preset(arguments.preset), sounds_folder=folder),
         sample_rate_hz=rate_hz,
     )

@@ -43,15 +43,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--days", type=float, default=0.0, metavar="D", help="days since then (default: %(default)g)")
     add("--site", metavar="NAME", help="name of the place (default: the known street's)")
     add("--model", type=Path, help="model that is used (default: the shipped one)")
-    add(
-        "--sides", action=argparse.BooleanOptionalAction, default=True,
-        help="learn the sound of either arm, which needs the whole recording (default: on)",
-    )  # fmt: skip
+    told = "learn the sound of either arm, which needs the whole recording (default: on)"
+    add("--sides", action=argparse.BooleanOptionalAction, default=True, help=told)
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, required=True, metavar="JSON", help="file to write")
-    add(
-        "--figure", type=Path, metavar="PNG", help="draw the street from above, after 1, 3, 10 and all passes"
-    )
+    told = "draw the street from above, after 1, 3, 10 and all passes"
+    add("--figure", type=Path, metavar="PNG", help=told)
 
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
