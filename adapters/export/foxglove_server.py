@@ -144,23 +144,15 @@ class OriginGate:
                 with suppress(ValueError):  # closed for a newer one
                     self._asking.remove((address, viewer))
             if not (_may_connect(head, self._origins) and self._places.acquire(blocking=False)):
-                self._refuse(viewer)
+                self.refused += 1
+                viewer.sendall(_REFUSED)
                 return
             try:
-                self._admit(head, viewer)
+                with socket.create_connection(self._server, _HEAD_S) as server:
+                    server.sendall(head)
+                    self._join(viewer, server)
             finally:
                 self._places.release()
-
-    def _admit(self, head: bytes, viewer: socket.socket) -> None:
-        viewer.settimeout(_HEAD_S)
-        with socket.create_connection(self._server, _HEAD_S) as server:
-            server.sendall(head)
-            self._join(viewer, server)
-
-    def _refuse(self, viewer: socket.socket) -> None:
-        self.refused += 1
-        with suppress(OSError):
-            viewer.sendall(_REFUSED)
 
     def _join(self, viewer: socket.socket, server: socket.socket) -> None:
         """Forward the data of both until one of them ends."""
@@ -209,9 +201,8 @@ def _head(viewer: socket.socket) -> bytes:
 
 def _may_connect(head: bytes, named: Collection[str]) -> bool:
     fields = parse_headers(io.BytesIO(head.partition(b"\r\n")[2]))
-    origins = fields.get_all("Origin", [None])
-    upgrade = fields.get("Upgrade", "").lower() == "websocket"
-    return upgrade and all(is_trusted(origin, named) for origin in origins)
+    trusted = all(is_trusted(origin, named) for origin in fields.get_all("Origin", [None]))
+    return trusted and fields.get("Upgrade", "").lower() == "websocket"
 
 
 @contextmanager

@@ -60,8 +60,7 @@ class LogMessage:
 
     @property
     def schema_name(self) -> str:
-        """Name of the type of the value."""
-        # Drawings have the names of Foxglove's types.
+        """Name of the type of the value; drawings have the names of Foxglove's types."""
         own = isinstance(self.value, WorldState)
         return "worldstate.Snapshot" if own else f"foxglove.{type(self.value).__name__}"
 
@@ -163,9 +162,6 @@ def image_message(stamp_ns: int, jpeg: bytes) -> LogMessage:
     return LogMessage(IMAGE_TOPIC, stamp_ns, image)
 
 
-TIMELINE = "stream"
-
-
 @contextmanager
 def rerun_file(path: Path) -> Iterator[LogSink]:
     """Yield a function that writes messages to a Rerun recording, which is named at the end of the block."""
@@ -176,7 +172,7 @@ def rerun_file(path: Path) -> Iterator[LogSink]:
         recording.log("/", rr.ViewCoordinates.FLU, static=True)
 
         def write(message: LogMessage) -> None:
-            recording.set_time(TIMELINE, duration=1e-9 * message.stamp_ns)
+            recording.set_time("stream", duration=1e-9 * message.stamp_ns)
             for place, drawn in _drawn(rr, message.topic, message.value):
                 recording.log(place, drawn)
 
@@ -203,11 +199,12 @@ def _drawn(rr: ModuleType, topic: str, value: Told) -> Iterator[tuple[str, objec
 
 def _shapes(rr: ModuleType, item: scene.SceneItem) -> Iterator[tuple[str, object]]:
     for number, one in enumerate(item.triangles):
-        corners = _points(one.points)
+        corners, color = _points(one.points), _color(one.color)
         triangles = np.arange(len(corners)).reshape(-1, 3)
-        color = _color(one.color)
-        mesh = rr.Mesh3D(vertex_positions=corners, triangle_indices=triangles, albedo_factor=color)
-        yield f"sector{number}", mesh
+        yield (
+            f"sector{number}",
+            rr.Mesh3D(vertex_positions=corners, triangle_indices=triangles, albedo_factor=color),
+        )
     if item.lines:
         strips, radii = zip(*((_points(one.points), 0.5 * one.thickness) for one in item.lines), strict=True)
         yield "lines", rr.LineStrips3D(strips, radii=radii, colors=_colors(item.lines))
@@ -228,14 +225,11 @@ def _points(points: Iterable[scene.Xyz]) -> FloatArray:
     return np.array([(one.x, one.y, one.z) for one in points], dtype=np.float64).reshape(-1, 3)
 
 
-def _color(color: scene.Rgba) -> tuple[int, int, int, int]:
-    red, green, blue, opaque = (round(255 * part) for part in (color.r, color.g, color.b, color.a))
-    return red, green, blue, opaque
+def _color(color: scene.Rgba) -> list[int]:
+    return [round(255 * part) for part in (color.r, color.g, color.b, color.a)]
 
 
-def _colors(
-    shapes: Iterable[scene.SceneLine | scene.SceneSolid | scene.SceneText],
-) -> list[tuple[int, int, int, int]]:
+def _colors(shapes: Iterable[scene.SceneLine | scene.SceneSolid | scene.SceneText]) -> list[list[int]]:
     return [_color(one.color) for one in shapes]
 
 

@@ -164,15 +164,13 @@ def autoware_objects(state: WorldState, crossing_m: float = CROSSING_M) -> dict[
     >>> autoware_objects(WorldState(1_500_000_000, 0, ego=ego))
     {'header': {'stamp': {'sec': 1, 'nanosec': 500000000}, 'frame_id': 'map'}, 'objects': []}
     """
-    ego = state.ego
-    if ego is None or not ego.localised:
+    if (ego := state.ego) is None or not ego.localised:
         got = "none" if ego is None else "a speed without a pose"
         expected = "expected odometry with x_m, y_m and yaw_rad"
         raise InvalidArgumentError(f"Autoware's objects stand in the map: {expected}, got {got}")
-    sec, nanosec = divmod(state.stamp_ns, 1_000_000_000)
-    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "map"}
+    stamp = dict(zip(("sec", "nanosec"), divmod(state.stamp_ns, 1_000_000_000), strict=True))
     objects = [_object(_in_map(one, ego)) for one in lane_objects(state, crossing_m)]
-    return {"header": header, "objects": objects}
+    return {"header": {"stamp": stamp, "frame_id": "map"}, "objects": objects}
 
 
 def is_localised(state: WorldState) -> bool:
@@ -212,31 +210,23 @@ def _object(one: LaneObject) -> dict[str, Any]:
     length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)
     kinds = [{"label": LABELS.get(kind, 0), "probability": share} for kind, share in _kinds(one.entity)]
     poses = [_pose(point, 0.5 * height, one.yaw_rad) for point in one.path_m()]
-    pose = {"pose": poses[0], "covariance": _covariance(one.covariance)}
-    twist = {"linear": _xyz(speed, 0.0), "angular": _xyz(0.0, 0.0)}  # in the axes of the object
     still = {"linear": _xyz(0.0, 0.0), "angular": _xyz(0.0, 0.0)}
+    twist = still | {"linear": _xyz(speed, 0.0)}  # in the axes of the object
     unknown = _covariance(np.diag([_UNKNOWN_VARIANCE] * 2))
-    path = {
-        "path": poses,
-        "time_step": {"sec": int(PATH_STEP_S), "nanosec": int(PATH_STEP_S % 1.0 * 1e9)},
-        "confidence": one.confidence,
-    }
+    step = {"sec": int(PATH_STEP_S), "nanosec": int(PATH_STEP_S % 1.0 * 1e9)}
     return {
         "object_id": {"uuid": list(uuid.UUID(one.entity.id).bytes)},
         "existence_probability": one.entity.existence_probability,
         # Planners use the first one, and fail without one.
         "classification": kinds,
         "kinematics": {
-            "initial_pose_with_covariance": pose,
+            "initial_pose_with_covariance": {"pose": poses[0], "covariance": _covariance(one.covariance)},
             "initial_twist_with_covariance": {"twist": twist, "covariance": unknown},
             "initial_acceleration_with_covariance": {"accel": still, "covariance": unknown},
-            "predicted_paths": [path],
+            "predicted_paths": [{"path": poses, "time_step": step, "confidence": one.confidence}],
         },
-        "shape": {
-            "type": 0,  # a bounding box
-            "footprint": {"points": []},
-            "dimensions": {"x": length, "y": width, "z": height},
-        },
+        # Type 0 is a bounding box.
+        "shape": {"type": 0, "footprint": {"points": []}, "dimensions": _xyz(length, width, height)},
     }
 
 
@@ -248,8 +238,8 @@ def _kinds(entity: Entity) -> list[tuple[str, float]]:
 
 
 def _pose(position_m: FloatArray, z_m: float, yaw_rad: float) -> dict[str, Any]:
-    (x, y), half = position_m.tolist(), 0.5 * yaw_rad
-    turned = {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)}
+    turned = _xyz(0.0, 0.0, math.sin(0.5 * yaw_rad)) | {"w": math.cos(0.5 * yaw_rad)}
+    x, y = position_m.tolist()
     return {"position": _xyz(x, y, z_m), "orientation": turned}
 
 
@@ -261,7 +251,7 @@ def _covariance(of_xy: FloatArray) -> list[float]:
     """Return the 6 x 6 covariance of x, y, z and three angles by rows; unknown variances are large."""
     whole = _UNKNOWN_VARIANCE * np.eye(6)
     whole[:2, :2] = of_xy
-    return [float(value) for value in whole.ravel()]
+    return list(map(float, whole.ravel()))
 
 
 # Numbers of osi3.MovingObject.VehicleClassification by those of Autoware; a person has another type.
@@ -281,13 +271,13 @@ def osi_sensor_data(state: WorldState, crossing_m: float = CROSSING_M) -> Any:
     """
     data = optional("osi3.osi_sensordata_pb2").SensorData()
     data.version.CopyFrom(_osi_version())
-    for stamp in (data.timestamp, data.last_measurement_time, data.moving_object_header.measurement_time):
+    header = data.moving_object_header
+    for stamp in (data.timestamp, data.last_measurement_time, header.measurement_time):
         stamp.seconds, stamp.nanos = divmod(state.stamp_ns, 1_000_000_000)
     data.sensor_id.value = 1
     # The state is in the axes of the vehicle, so the virtual sensor is at their origin.
     _set(data.mounting_position.position, x=0.0, y=0.0, z=0.0)
     _set(data.mounting_position.orientation, yaw=0.0, pitch=0.0, roll=0.0)
-    header = data.moving_object_header
     header.cycle_counter = state.seq
     impaired = any(sensor.condition != "working" for sensor in state.sensors)
     available = "AVAILABLE_REDUCED" if impaired else "AVAILABLE"
@@ -337,13 +327,12 @@ def _osi_mcap(file: BinaryIO | GrowingFile) -> Iterator[Callable[[Any, int], Non
     osi, protobuf = _osi_versions()
     writer = optional("mcap.writer").Writer(file, chunk_size=1 << 12)  # a second of states
     writer.start()
-    bounds = {f"{bound}_osi_version": osi for bound in ("min", "max")}
-    bounds |= {f"{bound}_protobuf_version": protobuf for bound in ("min", "max")}
+    about = {"osi_version": osi, "protobuf_version": protobuf}
+    bounds = {f"{bound}_{name}": version for bound in ("min", "max") for name, version in about.items()}
     writer.add_metadata("net.asam.osi.trace", {"version": osi} | bounds)
     kind = optional("osi3.osi_sensordata_pb2").SensorData
     schema = optional("mcap_protobuf.schema").register_schema(writer, kind)
-    about = {"osi_version": osi, "protobuf_version": protobuf}
-    told = {f"net.asam.osi.trace.channel.{key}": version for key, version in about.items()}
+    told = {f"net.asam.osi.trace.channel.{name}": version for name, version in about.items()}
     channel = writer.register_channel("SensorData", "protobuf", schema, told)
 
     def write(data: Any, number: int) -> None:
@@ -380,8 +369,8 @@ def _fill(moving: Any, one: LaneObject, relative_mps: FloatArray) -> None:
     header.tracking_id.value = uuid.UUID(entity.id).int & (1 << 63) - 1
     header.existence_probability = entity.existence_probability
     header.age = seconds(entity.updated_ns - entity.created_ns)
-    known = "PREDICTED" if entity.status == "hidden" or not one.measured else "MEASURED"
-    header.measurement_state = getattr(header, f"MEASUREMENT_STATE_{known}")
+    found = "MEASURED" if one.measured and entity.status != "hidden" else "PREDICTED"
+    header.measurement_state = getattr(header, f"MEASUREMENT_STATE_{found}")
     (x, y), (vx, vy) = one.position_m.tolist(), relative_mps.tolist()
     x_std, y_std = (one.covariance.diagonal() ** 0.5).tolist()
     length, width, height = SIZES_M.get(likeliest_label(one), CAR_M)

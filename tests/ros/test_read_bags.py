@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from bag_messages import CHANNELS, RATE_HZ, bag_of, block, blocks, info, moved, read_bag, sound_of
+from damaged_files import damaged
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -332,21 +333,15 @@ def test_a_damaged_bag_raises_an_error_with_its_name(tmp_path, storage):
         bag_of(tmp_path / "whole", blocks(samples), storage)
     (good,) = (file for file in (tmp_path / "whole").iterdir() if file.suffix != ".yaml")
     content, rng, refused = good.read_bytes(), np.random.default_rng(3), 0
-    damaged = tmp_path / f"damaged{good.suffix}"
-    for trial in range(40):
-        spoiled = bytearray(content)
-        if trial % 2:
-            spoiled = spoiled[: rng.integers(len(spoiled))]
-        else:
-            for place in rng.integers(0, len(spoiled), 8 if trial % 4 else 2000):
-                spoiled[place] = rng.integers(256)
-        damaged.write_bytes(spoiled)
+    spoilt = tmp_path / f"damaged{good.suffix}"
+    for _ in range(40):
+        spoilt.write_bytes(damaged(content, rng))
         try:
-            with open_sound(read_bag(damaged).sound, strict=False) as audio:
+            with open_sound(read_bag(spoilt).sound, strict=False) as audio:
                 list(audio.blocks())
         except InputFileError as error:
             refused += 1
-            assert str(error).startswith(str(damaged))
+            assert str(error).startswith(str(spoilt))
     assert refused >= 20
 
 

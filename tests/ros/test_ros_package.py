@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from bag_messages import block, image
 from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
@@ -63,11 +64,6 @@ class Node:
         return SimpleNamespace(warning=say, error=say)
 
 
-def message_class(kind):
-    """Return a class of messages whose fields `set_message_fields` fills."""
-    return type("Message", (), {"kind": kind, "values": None})
-
-
 def set_message_fields(one, values):
     check_fields(one.kind, values)
     one.values = values
@@ -86,6 +82,13 @@ def check_fields(kind, values):
                 check_fields(about[0][1], one)
 
 
+def put_modules(monkeypatch, modules):
+    for name, members in modules.items():
+        module = ModuleType(name)
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, name, module)
+
+
 @pytest.fixture
 def node_of(monkeypatch):
     """Return a function that makes the node with given parameters."""
@@ -97,11 +100,10 @@ def node_of(monkeypatch):
         if found := re.match(r"from (\w+_msgs)\.msg import (.+)", line):
             names = found[2].split(", ")
             modules[found[1]] = {}
-            modules[f"{found[1]}.msg"] = {one: message_class(f"{found[1]}/msg/{one}") for one in names}
-    for name, members in modules.items():
-        module = ModuleType(name)
-        vars(module).update(members)
-        monkeypatch.setitem(sys.modules, name, module)
+            # `set_message_fields` fills the fields of a message.
+            kinds = {one: {"kind": f"{found[1]}/msg/{one}", "values": None} for one in names}
+            modules[f"{found[1]}.msg"] = {one: type(one, (), fields) for one, fields in kinds.items()}
+    put_modules(monkeypatch, modules)
     monkeypatch.syspath_prepend(PACKAGE)
     module = import_module("worldstate_ros.node")
     monkeypatch.setattr(module, "rclpy", SimpleNamespace(**modules["rclpy"]))
@@ -116,16 +118,14 @@ def node_of(monkeypatch):
 
 
 def sound_message(samples, stamp_ns, rate_hz, layout="interleaved"):
-    about = {"sample_rate": rate_hz, "channels": samples.shape[1], "layout": layout}
-    data = (samples.T if layout == "planar" else samples).ravel()
-    return message(
-        "worldstate_msgs/msg/MultiChannelAudio", {"header": header(stamp_ns), "data": data} | about
-    )
+    data = samples.T if layout == "planar" else samples
+    _, kind, _, values = block(data, stamp_ns, layout=layout, channels=samples.shape[1], sample_rate=rate_hz)
+    return message(kind, values)
 
 
 def image_message(frame, stamp_ns):
-    boxes = list(bag_writer._boxes(frame))
-    return message("vision_msgs/msg/Detection2DArray", {"header": header(stamp_ns), "detections": boxes})
+    _, kind, _, values = image(stamp_ns, 0, *bag_writer._boxes(frame))
+    return message(kind, values)
 
 
 def moved_message(stamp_ns, speed_mps, frame="odom"):
@@ -141,12 +141,8 @@ def heard(approach):
         rate_hz, blocks = audio.sample_rate_hz, list(audio.blocks(audio.sample_rate_hz // 10))[:50]
     found, at = read_detections(approach.detections_path), np.cumsum([0, *map(len, blocks)])
     stamps_ns = [START_NS + round(1e9 * first / rate_hz) for first in at[:-1].tolist()]
-    return (
-        blocks,
-        stamps_ns,
-        rate_hz,
-        [one for one in zip(found.stamps_ns.tolist(), found.frames, strict=True) if one[0] < 5 * 10**9],
-    )
+    images = [one for one in zip(found.stamps_ns.tolist(), found.frames, strict=True) if one[0] < 5 * 10**9]
+    return blocks, stamps_ns, rate_hz, images
 
 
 @pytest.fixture
@@ -160,21 +156,20 @@ def parameters(approach, tmp_path):
 def test_states_of_the_node_equal_those_of_the_library(node_of, parameters, heard, layout):
     blocks, stamps_ns, rate_hz, images = heard
     node, late_ns = node_of(**parameters), 150_000_000
-    coming = [(ns + len(block) * 10**9 // rate_hz, "audio", sound_message(block, ns, rate_hz, layout))
-              for block, ns in zip(blocks, stamps_ns, strict=True)]  # fmt: skip
-    coming += [
-        (START_NS + ns + late_ns, "detections", image_message(one, START_NS + ns)) for ns, one in images
-    ]
+    coming = [(ns + len(part) * 10**9 // rate_hz, "audio", sound_message(part, ns, rate_hz, layout))
+              for part, ns in zip(blocks, stamps_ns, strict=True)]  # fmt: skip
+    seen = [(START_NS + ns, one) for ns, one in images]
+    coming += [(ns + late_ns, "detections", image_message(one, ns)) for ns, one in seen]
     for _, topic, one in sorted(coming, key=lambda one: one[0]):
         node.topics[topic](one)
     camera = Path(parameters["camera"])
     listener = worldstate.Listener(parameters["array"], rate_hz, start_s=1e-9 * START_NS, camera=camera)
     states = []
-    for block, first_ns in zip(blocks, stamps_ns, strict=True):
-        for ns, frame in images:
-            if first_ns <= START_NS + ns < first_ns + 10**8:
-                listener.look(START_NS + ns, frame)
-        states += listener.push(block)
+    for part, first_ns in zip(blocks, stamps_ns, strict=True):
+        for ns, frame in seen:
+            if first_ns <= ns < first_ns + 10**8:
+                listener.look(ns, frame)
+        states += listener.push(part)
     sent = [worldstate.WorldState.from_json(one["data"]) for one in node.sent["~/snapshot"]]
     assert len(states) - len(sent) in (2, 3)  # for the last blocks the node still waits for boxes
     for got, state in zip(sent, states, strict=False):
@@ -183,9 +178,8 @@ def test_states_of_the_node_equal_those_of_the_library(node_of, parameters, hear
         assert [cue.advisory is None for cue in got.cues] == [cue.advisory is None for cue in state.cues]
         assert (got.delivery, got.budget) == (state.delivery, state.budget)
         # Rounding of message lengths changes the time of a look by nanoseconds.
-        assert [one.stamp_ns for one in got.searched] == pytest.approx(
-            [one.stamp_ns for one in state.searched], abs=1000, rel=0
-        )
+        looks_ns = [one.stamp_ns for one in state.searched]
+        assert [one.stamp_ns for one in got.searched] == pytest.approx(looks_ns, abs=1000, rel=0)
     assert node.sent["~/advisories"] == [bag_writer.risk_advisories(one) for one in sent]
     assert len(node.sent["~/markers"]) == len(sent)
     assert any(one["raised"] for told in node.sent["~/advisories"] for one in told["advisories"])
@@ -196,13 +190,17 @@ def states_of(node):
     return [json.loads(one["data"]) for one in node.sent["~/snapshot"]]
 
 
+def give(node, heard, numbers):
+    """Send blocks of sound by their numbers."""
+    blocks, stamps_ns, rate_hz, _ = heard
+    for k in numbers:
+        node.topics["audio"](sound_message(blocks[k], stamps_ns[k], rate_hz))
+
+
 @pytest.mark.long
 def test_lost_messages_become_silence(node_of, parameters, heard):
-    blocks, stamps_ns, rate_hz, _ = heard
-    node = node_of(**parameters | {"wait_s": 0.0})
-    for k, (block, ns) in enumerate(zip(blocks, stamps_ns, strict=True)):
-        if not 14 <= k < 28:
-            node.topics["audio"](sound_message(block, ns, rate_hz))
+    stamps_ns, node = heard[1], node_of(**parameters | {"wait_s": 0.0})
+    give(node, heard, [k for k in range(len(stamps_ns)) if not 14 <= k < 28])
     assert len(node.said) == 1
     assert node.said[0].startswith("audio: 1.4")
     states = states_of(node)
@@ -212,11 +210,8 @@ def test_lost_messages_become_silence(node_of, parameters, heard):
 
 @pytest.mark.long
 def test_a_repeated_bag_restarts_the_run(node_of, parameters, heard):
-    blocks, stamps_ns, rate_hz, _ = heard
     node = node_of(**parameters | {"wait_s": 0.0})
-    for _ in range(2):
-        for block, ns in zip(blocks[:35], stamps_ns, strict=False):
-            node.topics["audio"](sound_message(block, ns, rate_hz))
+    give(node, heard, [*range(35), *range(35)])
     stamps = [one["stamp_ns"] for one in states_of(node)]
     assert len(stamps) % 2 == 0
     assert stamps[: len(stamps) // 2] == stamps[len(stamps) // 2 :]
@@ -225,11 +220,10 @@ def test_a_repeated_bag_restarts_the_run(node_of, parameters, heard):
 
 @pytest.mark.long
 def test_objects_need_a_pose_in_the_map(node_of, parameters, heard):
-    blocks, stamps_ns, rate_hz, _ = heard
     node = node_of(**parameters | {"wait_s": 0.0, "moving": True})
-    for k, (block, ns) in enumerate(zip(blocks[:20], stamps_ns, strict=False)):
+    for k, ns in enumerate(heard[1][:20]):
         node.topics["odometry"](moved_message(ns, 2.0, "map" if k >= 14 else "odom"))
-        node.topics["audio"](sound_message(block, ns, rate_hz))
+        give(node, heard, [k])
     states = states_of(node)
     localised = [one for one in states if one["ego"] is not None and one["ego"]["localised"]]
     assert 0 < len(node.sent["~/objects"]) == len(localised) < len(states)
@@ -243,19 +237,16 @@ def test_unreadable_messages_are_counted(node_of, parameters, heard):
     blocks, stamps_ns, rate_hz, images = heard
     node = node_of(**parameters | {"wait_s": 0.0})
     node.topics["detections"](image_message(images[0][1], START_NS))  # before the first sound
-    for block, ns in zip(blocks[:11], stamps_ns, strict=False):
-        node.topics["audio"](sound_message(block, ns, rate_hz))
+    give(node, heard, range(11))
     wrong = sound_message(blocks[11], stamps_ns[11], rate_hz)
-    wrong.channels = 7
-    node.topics["audio"](wrong)
-    wrong.channels = 0
-    node.topics["audio"](wrong)
+    for wrong.channels in (7, 0):
+        node.topics["audio"](wrong)
     nan = sound_message(blocks[11], stamps_ns[11], rate_hz)
     nan.data[5] = np.nan
     node.topics["audio"](nan)
     outside = worldstate.DetectionFrame(np.array([[9e4, 1.0, 9.1e4, 400.0]]), np.array([0.9]), ("car",))
     node.topics["detections"](image_message(outside, stamps_ns[11]))
-    node.topics["audio"](sound_message(blocks[12], stamps_ns[12], rate_hz))
+    give(node, heard, [12])
     assert states_of(node)[-1]["delivery"]["refused"] >= 3
     assert {text.split(":")[0] for text in node.said} == {"audio", "detections"}
 
@@ -273,7 +264,7 @@ def clock():
     of = {"deque": deque}
     tree = ast.parse(NODE.read_text())
     kept = [
-        one for one in tree.body if getattr(one, "name", "") == "SampleClock" or isinstance(one, ast.Assign)
+        one for one in tree.body if isinstance(one, ast.Assign) or getattr(one, "name", "") == "SampleClock"
     ]
     exec(compile(ast.Module(kept, []), str(NODE), "exec"), of)
     return of["SampleClock"]
@@ -340,16 +331,14 @@ def test_the_launch_file_starts_the_node_with_its_topics(monkeypatch):
     def actions(name):
         return lambda *given, **parts: made.setdefault(name, []).append((given, parts))
 
-    for name, members in {
+    modules = {
         "ament_index_python.packages": {"get_package_share_directory": lambda name: str(PACKAGE)},
         "launch": {"LaunchDescription": list},
         "launch.actions": {"DeclareLaunchArgument": actions("argument")},
         "launch.substitutions": {"LaunchConfiguration": lambda name: name},
         "launch_ros.actions": {"Node": actions("node")},
-    }.items():
-        module = ModuleType(name)
-        vars(module).update(members)
-        monkeypatch.setitem(sys.modules, name, module)
+    }
+    put_modules(monkeypatch, modules)
     given = {}
     exec((PACKAGE / "launch" / "worldstate.launch.py").read_text(), given)
     assert len(given["generate_launch_description"]()) == len(made["argument"]) + 1

@@ -72,9 +72,8 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.operations.corpus.corpus_inputs import find_corpus, share_of
     from worldstate.operations.corpus.corpus_run import hear
 
-    shard, (context, sides) = _share(arguments.shard), inputs.place_of(arguments.context)
-    taken = "array", "car", "camera", "model", "budget", "alpha", "uncalibrated", "hops", "cascade"
-    parts = {name: vars(arguments)[name] for name in taken} | {"context": context, "sides": sides}
+    shard, taken = _share(arguments.shard), ("array", "car", "camera", "hops", "cascade")
+    parts = inputs.listen_parts(arguments) | {name: vars(arguments)[name] for name in taken}
     begun_s, count = time.perf_counter(), len(share_of(find_corpus(arguments.corpus), *shard))
     with _executor(arguments.scheduler) as executor, progress.progress_bar("hearing", count) as bar:
 

@@ -140,7 +140,7 @@ def _source(arguments: argparse.Namespace, sensors: "SourceSensors", sound: Path
     before = None if arguments.resume is None else adapters.read_checkpoint(arguments.resume)
     # With live sound, the odometry file of the car only shows that it moves; its motion is used for a played
     # recording.
-    car, (context, sides) = sensors.car, inputs.place_of(arguments.context)
+    car = sensors.car
     path = None if arguments.odometry is not None else car.odometry
     drive = None if path is None else read_odometry(path)
     ended_s = 0.0 if before is None else ground.seconds(before.world.stamp_ns)
@@ -150,16 +150,11 @@ def _source(arguments: argparse.Namespace, sensors: "SourceSensors", sound: Path
         car.array,
         camera=sensors.camera,
         miss_rates=sensors.setup.miss_rates,
-        model=arguments.model or car.model,
-        context=context,
-        sides=sides,
         odometry=drive if arguments.play is not None else None,
         moving_ego=arguments.odometry is not None or (drive is not None and drive.moves),
         resume=before,
         start_s=ended_s if arguments.start is None else arguments.start,
-        budget=arguments.budget,
-        alpha=arguments.alpha,
-        uncalibrated=arguments.uncalibrated,
+        **inputs.listen_parts(arguments) | {"model": arguments.model or car.model},
         settings=sensors.boxes_in(adapters.ListenSettings(), detector),
     )
     return replace(source, crossing_m=car.crossing_m)

@@ -43,7 +43,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     check_extra(*exports.needed_extras(arguments))
     from worldstate.operations.viewing.state_figure import drawn_run
 
-    context, sides = inputs.place_of(arguments.context)
     source = adapters.open_source(
         arguments.input,
         arguments.array,
@@ -51,16 +50,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         camera=arguments.camera,
         detections=inputs.reported(arguments),
         detector=arguments.detector,
-        model=arguments.model,
-        context=context,
-        sides=sides,
         odometry=arguments.odometry,
         topics=inputs.named("--topic", arguments.topic),
         resume=arguments.resume,
         start_s=arguments.start or 0.0,
-        budget=arguments.budget,
-        alpha=arguments.alpha,
-        uncalibrated=arguments.uncalibrated,
+        **inputs.listen_parts(arguments),
     )
     with (
         drawn_run(arguments.figure, source, str(source.audio_path)) as draw,

@@ -14,6 +14,7 @@ Examples
 """
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from worldstate.cli.common import command, inputs, output, progress
@@ -31,8 +32,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
-    from dataclasses import asdict
-
     from worldstate.adapters.vehicle.car_file import write_aligned
     from worldstate.operations.alignment.camera_alignment import LARGEST_OFFSET_S, align, heard_passes
     from worldstate.operations.calibration.cueing_calibration import find_inputs

@@ -30,19 +30,19 @@ import argparse
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from worldstate import frontend
+from worldstate.adapters.audio.sound_file import Audio, open_sound
+from worldstate.adapters.files.array_file import array_csv, write_array_xml
+from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common import inputs, output, progress
+from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
+from worldstate.frontend.health.position_check import PositionCheck
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.serialisation import encode
-
-if TYPE_CHECKING:
-    from worldstate.adapters.audio.sound_file import Audio
-    from worldstate.frontend.health.position_check import PositionCheck
-    from worldstate.operations.recordings.channel_report import RecordingHealth
+from worldstate.operations.recordings import channel_report
 
 # Least extent in shortest wavelengths; units that are taken for metres; extents of usual arrays, m.
 _LEAST_WAVE = 0.1
@@ -69,10 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
-    from worldstate.adapters.files.array_file import array_csv, write_array_xml
-    from worldstate.adapters.files.file_io import write_text
     from worldstate.frontend.health.fitted_positions import fit_positions
-    from worldstate.operations.recordings import channel_report
 
     output.check_outputs(arguments, *([] if arguments.fit == _PRINTED else ["fit"]), figures=("figure",))
     if arguments.fit not in (None, _PRINTED) and arguments.fit.suffix not in (".csv", ".xml"):
@@ -113,8 +110,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 def check_extent(array: "frontend.MicrophoneArray", highest_hz: float) -> None:
     """Refuse an array much smaller than the shortest wave, and suggest the unit of its numbers."""
-    from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S
-
     extent_m, least_m = array.widest_m, _LEAST_WAVE * SPEED_OF_SOUND_M_S / highest_hz
     if extent_m < least_m:
         units = [unit for unit, factor in _UNITS.items() if _USUAL_M[0] < factor * extent_m < _USUAL_M[1]]
@@ -124,13 +119,10 @@ def check_extent(array: "frontend.MicrophoneArray", highest_hz: float) -> None:
 
 
 def examine(
-    audio: "Audio", front_end: "frontend.FrontEnd", heard_from_deg: float | None = None
-) -> "tuple[RecordingHealth, PositionCheck]":
+    audio: Audio, front_end: "frontend.FrontEnd", heard_from_deg: float | None = None
+) -> tuple[channel_report.RecordingHealth, PositionCheck]:
     """Process an open recording; return the health of its channels, and the check of positions."""
-    from worldstate.frontend.health.position_check import PositionCheck
-    from worldstate.operations.recordings.channel_report import HealthLog
-
-    log, check = HealthLog(), PositionCheck(front_end.array, audio.sample_rate_hz)
+    log, check = channel_report.HealthLog(), PositionCheck(front_end.array, audio.sample_rate_hz)
     with progress.sound_bar(audio) as bar:
         for block in audio.blocks(audio.sample_rate_hz):
             check.push(block)
@@ -143,10 +135,7 @@ def examine(
     return replace(health, positions=check.verdict(usable, heard_from_rad)), check
 
 
-def _heard(path: Path, array: "frontend.MicrophoneArray") -> "PositionCheck":
-    from worldstate.adapters.audio.sound_file import open_sound
-    from worldstate.frontend.health.position_check import PositionCheck
-
+def _heard(path: Path, array: "frontend.MicrophoneArray") -> PositionCheck:
     with open_sound(path, array.n_microphones, channels=array.channels, strict=False) as audio:
         check = PositionCheck(array, audio.sample_rate_hz)
         for block in audio.blocks(audio.sample_rate_hz):

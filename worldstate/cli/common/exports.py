@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from worldstate import adapters
 from worldstate.ground import in_range
@@ -19,10 +19,7 @@ from .inputs import describe
 
 if TYPE_CHECKING:
     from worldstate.adapters.export.log_messages import LogMessage, LogSink
-    from worldstate.adapters.files.file_io import FileOpener
     from worldstate.state import WorldState
-
-    Stack = AbstractContextManager[Callable[[WorldState], object]]
 
 _LOG = logging.getLogger(__name__)
 FOXGLOVE_PORT = 8765
@@ -90,8 +87,8 @@ def _asked(arguments: argparse.Namespace) -> list[tuple[str, str]]:
 class Exports:
     """The open targets of --export."""
 
-    viewers: "list[LogSink]" = field(default_factory=list)  # Take messages
-    stacks: "list[Callable[[WorldState], object]]" = field(default_factory=list)  # Take states
+    viewers: "list[Callable[[LogMessage], object]]" = field(default_factory=list)
+    stacks: "list[Callable[[WorldState], object]]" = field(default_factory=list)
 
     def message(self, message: "LogMessage") -> None:
         """Pass a message on to every viewer."""
@@ -120,10 +117,8 @@ def open_exports(
     with ExitStack() as opened:
         exports = Exports()
         for name, target in _asked(arguments):
-            if name in _VIEWERS:
-                exports.viewers.append(opened.enter_context(_viewer(name, target, live, arguments)))
-            else:
-                exports.stacks.append(opened.enter_context(_stack(name, target, crossing_m, live, arguments)))
+            taker = opened.enter_context(_target(name, target, crossing_m, live, arguments))
+            (exports.viewers if name in _VIEWERS else exports.stacks).append(taker)
         yield exports
 
 
@@ -131,22 +126,6 @@ def most_bytes(arguments: argparse.Namespace) -> int | None:
     """Return the largest size of a log by --rotate-mib, None without it."""
     most_mib: int | None = getattr(arguments, "rotate_mib", None)
     return None if most_mib is None else int(in_range("--rotate-mib", most_mib, 1, 1 << 30)) << 20
-
-
-def _viewer(
-    name: str, target: str, live: bool, arguments: argparse.Namespace
-) -> "AbstractContextManager[LogSink]":
-    from worldstate.adapters.export.log_messages import mcap_file, rerun_file
-
-    if name == "foxglove":
-        return _websocket(target, not live, arguments.origin)
-    return rerun_file(Path(target)) if name == "rerun" else mcap_file(Path(target), _opener(live, arguments))
-
-
-def _opener(live: bool, arguments: argparse.Namespace) -> "FileOpener":
-    from worldstate.adapters.files.file_io import GrowingFile, whole_file
-
-    return partial(GrowingFile, most_bytes=most_bytes(arguments)) if live else whole_file
 
 
 @contextmanager
@@ -160,28 +139,37 @@ def _websocket(port: str, paced: bool, origins: list[str]) -> "Iterator[LogSink]
         yield send
 
 
-def _stack(name: str, target: str, crossing_m: float, live: bool, arguments: argparse.Namespace) -> "Stack":
-    from worldstate.adapters.export import other_stacks
-    from worldstate.adapters.own_parts import ExporterPart, load_part, own_exporter
+def _target(
+    name: str, target: str, crossing_m: float, live: bool, arguments: argparse.Namespace
+) -> "AbstractContextManager[Callable[[Any], object]]":
+    """Return the open function of one --export, for messages of a viewer or for states."""
+    from worldstate.adapters.export import log_messages, other_stacks
+    from worldstate.adapters.files.file_io import GrowingFile, whole_file
+    from worldstate.adapters.own_parts import load_part, own_exporter
     from worldstate.adapters.ros.bag_writer import state_bag
 
-    opener, comes = _opener(live, arguments), live and arguments.odometry is not None
-    own: dict[str, ExporterPart] = {
-        "osi": lambda path: other_stacks.osi_trace(Path(path), crossing_m, opener),
-        "autoware": lambda path: other_stacks.autoware_lines(Path(path), crossing_m, opener, comes=comes),
-        "mot": lambda path: other_stacks.mot_lines(Path(path), opener),
-        "odas": partial(other_stacks.odas_socket, live=live),
-        "rosbag": lambda path: state_bag(Path(path), crossing_m),
-        "rosbag-sqlite3": lambda path: state_bag(Path(path), crossing_m, "sqlite3"),
+    opener = partial(GrowingFile, most_bytes=most_bytes(arguments)) if live else whole_file
+    path, comes = Path(target), live and arguments.odometry is not None
+    own: dict[str, Callable[[], AbstractContextManager[Callable[[Any], object]]]] = {
+        "mcap": lambda: log_messages.mcap_file(path, opener),
+        "rerun": lambda: log_messages.rerun_file(path),
+        "foxglove": lambda: _websocket(target, not live, arguments.origin),
+        "osi": lambda: other_stacks.osi_trace(path, crossing_m, opener),
+        "autoware": lambda: other_stacks.autoware_lines(path, crossing_m, opener, comes=comes),
+        "mot": lambda: other_stacks.mot_lines(path, opener),
+        "odas": lambda: other_stacks.odas_socket(target, live=live),
+        "rosbag": lambda: state_bag(path, crossing_m),
+        "rosbag-sqlite3": lambda: state_bag(path, crossing_m, "sqlite3"),
     }
-    if name in own:
-        opened: Stack = own[name](target)
-        return _expendable(target, opened) if live and name.startswith("rosbag") else opened
-    return own_exporter(name, load_part("worldstate.exporters", name, "--export", EXPORTERS), target)
+    if name not in own:
+        return own_exporter(name, load_part("worldstate.exporters", name, "--export", EXPORTERS), target)
+    return _expendable(target, own[name]()) if live and name.startswith("rosbag") else own[name]()
 
 
 @contextmanager
-def _expendable(target: str, stack: "Stack") -> "Iterator[Callable[[WorldState], object]]":
+def _expendable(
+    target: str, stack: "AbstractContextManager[Callable[[WorldState], object]]"
+) -> "Iterator[Callable[[WorldState], object]]":
     """Yield the function of a bag; if the bag cannot be written, print a notice and continue the run."""
     failed = False
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import getdoc
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from worldstate import adapters, frontend
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
@@ -137,6 +137,13 @@ def add_listen_options(parser: argparse.ArgumentParser) -> None:
     add("--uncalibrated", action="store_true", help=text)
     text = "corners, lanes and rates of this place (default: a usual blind junction)"
     add("--context", type=Path, metavar="FILE", help=text)
+
+
+def listen_parts(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of `open_source` that `add_listen_options` declares."""
+    context, sides = place_of(arguments.context)
+    same = {name: vars(arguments)[name] for name in ("model", "budget", "alpha", "uncalibrated")}
+    return same | {"context": context, "sides": sides}
 
 
 def add_budget_options(parser: argparse.ArgumentParser) -> None:

@@ -3,18 +3,16 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from .output import printable
+from worldstate.adapters.live.live_listening import LiveStep
+from worldstate.state import Entity, RiskCue, WorldState
 
-if TYPE_CHECKING:
-    from worldstate.adapters.live.live_listening import LiveStep
-    from worldstate.state import Entity, RiskCue, WorldState
+from .output import printable
 
 # Every second state: ten per second cannot be read, and drawing takes some milliseconds.
 _SHOWN_EVERY_NS = 200_000_000
@@ -26,12 +24,12 @@ _MOST_ENTITIES = 6
 
 
 @contextmanager
-def live_view() -> "Iterator[Callable[[LiveStep], None]]":
+def live_view() -> Iterator[Callable[[LiveStep], None]]:
     """Yield a function that shows a hop on standard error."""
     console, last_ns = Console(stderr=True), -_SHOWN_EVERY_NS
     with Live(console=console, auto_refresh=False, transient=True) as screen:
 
-        def show(live: "LiveStep") -> None:
+        def show(live: LiveStep) -> None:
             nonlocal last_ns
             stamp_ns = live.step.state.stamp_ns
             if stamp_ns - last_ns >= _SHOWN_EVERY_NS:
@@ -41,7 +39,7 @@ def live_view() -> "Iterator[Callable[[LiveStep], None]]":
         yield show
 
 
-def view_of(live: "LiveStep") -> RenderableType:
+def view_of(live: LiveStep) -> RenderableType:
     """Return one screen."""
     state = live.step.state
     late = f"latency {1e3 * live.latency_s:.0f} ms"
@@ -51,7 +49,7 @@ def view_of(live: "LiveStep") -> RenderableType:
     return Group(head, _bearing(state), *map(_cue, state.cues), _entities(state.entities))
 
 
-def _bearing(state: "WorldState") -> Text:
+def _bearing(state: WorldState) -> Text:
     if state.bearing is None:
         return Text("left  " + "·" * _SCALE + "  right   no bearing", style="dim")
     azimuth, std_deg = state.bearing.azimuth_rad, math.degrees(state.bearing.std_rad)
@@ -61,7 +59,7 @@ def _bearing(state: "WorldState") -> Text:
     return Text(f"left  {scale}  right   {math.degrees(azimuth):+.0f} ± {std_deg:.0f} deg")
 
 
-def _cue(cue: "RiskCue") -> Text:
+def _cue(cue: RiskCue) -> Text:
     line = Text(printable(f"{cue.direction or '?':<6}"), style="bold")
     if cue.risk is not None:
         filled = round(cue.risk * _BAR)
@@ -73,7 +71,7 @@ def _cue(cue: "RiskCue") -> Text:
     return line
 
 
-def _entities(entities: "tuple[Entity, ...]") -> Table:
+def _entities(entities: tuple[Entity, ...]) -> Table:
     table = Table("entity", "status", "exists", "azimuth", "is", box=None, padding=(0, 2, 0, 0))
     likeliest = sorted(entities, key=lambda one: -one.existence_probability)[:_MOST_ENTITIES]
     for one in likeliest:

@@ -5,16 +5,13 @@ import json
 import os
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from worldstate import adapters
 from worldstate.ground.errors import InputFileError
 
 from .exports import exported_files
-
-if TYPE_CHECKING:
-    from worldstate import adapters
 
 _SINCE_1970_S = 1e9
 
@@ -69,8 +66,6 @@ def print_result(result: CommandResult, *, as_json: bool) -> None:
 
 def box_counts(source: "adapters.Source", *, as_json: bool) -> object:
     """Return how many boxes are used and why the others are not, per camera; None without a camera."""
-    from dataclasses import replace
-
     from worldstate.adapters.camera.detections import count_boxes, told_counts
 
     keep = replace(source.settings.boxes, image_height_px=source.camera.height_px)

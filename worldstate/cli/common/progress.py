@@ -5,16 +5,15 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from worldstate import adapters, frontend, operations
 from worldstate.ground.extras import has_extra
 
 from .output import printable, say
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from worldstate import adapters, frontend, operations
     from worldstate.adapters.audio.sound_file import Audio
 
 Item = TypeVar("Item")
@@ -120,11 +119,10 @@ def track(items: Iterable[Item], description: str, total: float | None = None) -
 def listen_with_progress(
     source: "adapters.Source",
     *,
-    states_path: "Path | None",
+    states_path: Path | None,
     on_hop: "Callable[[adapters.Step], None]" = lambda step: None,
 ) -> "operations.RecordingReport":
     """Run a recording to its end with a progress bar in seconds of sound."""
-    from worldstate import operations
     from worldstate.adapters.audio.sound_file import RawPcm, open_sound
 
     hops = None
@@ -141,7 +139,7 @@ def listen_with_progress(
 
 
 def read_streams(
-    inputs: "Iterable[Path]", array: "frontend.MicrophoneArray | None", model: "Path | None"
+    inputs: Iterable[Path], array: "frontend.MicrophoneArray | None", model: Path | None
 ) -> "list[operations.HopTable]":
     """Return the hop streams of data sets, recordings, sound files and files of --save-streams."""
     from worldstate.operations.calibration.cueing_calibration import find_inputs, read_input

@@ -19,6 +19,8 @@ Examples
 """
 
 import argparse
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,15 +70,12 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 def _scene(
     arguments: argparse.Namespace, make: "MakeDetector", path: Path, reference: Path | None
 ) -> "LabelledVideo":
-    from dataclasses import replace
-    from math import radians
-
     from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, reference_by
 
     video = adapters.open_video(path)
     camera = adapters.PinholeCamera.ovad(width_px=video.width_px, height_px=video.height_px)
     if arguments.half_angle is not None:
-        camera = replace(camera, half_angle_rad=radians(arguments.half_angle))
+        camera = replace(camera, half_angle_rad=math.radians(arguments.half_angle))
     boxes = arguments.reference or reference
     if boxes is None:
         return LabelledVideo(video, reference_by(make(), video), camera)

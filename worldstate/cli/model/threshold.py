@@ -19,15 +19,13 @@ Examples
 """
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from worldstate import adapters, operations
 from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 NEEDS = ("sklearn",)
 
@@ -48,8 +46,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
-    from dataclasses import replace
-
     from worldstate.operations.recordings.hop_table import save_tables
 
     output.check_outputs(arguments, "out", "save_streams")
@@ -74,7 +70,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _with_curve(
-    model: "adapters.Model", streams: "Sequence[operations.HopTable]", budget: float | None
+    model: "adapters.Model", streams: Sequence["operations.HopTable"], budget: float | None
 ) -> "adapters.Model":
     """Return a model with the curve of a corpus; a model without a sequence is unchanged."""
     import numpy as np

@@ -37,6 +37,7 @@ Examples
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -137,8 +138,6 @@ def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _stream_settings(arguments: argparse.Namespace) -> "StreamSettings":
-    from dataclasses import replace
-
     from worldstate.simulation.dataset.dataset import BANDWIDTHS_HZ
     from worldstate.simulation.scene.settings import SAMPLE_RATE_HZ, SIGNALS, rate_for
     from worldstate.simulation.stream.settings import StreamSettings, traffic_named

@@ -21,6 +21,7 @@ Examples
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,8 +31,6 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.corpus.corpus_inputs import CARD_NAME
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from worldstate.operations.labelling.pass_labels import BoxTrack, PassLabel
 
 
@@ -101,10 +100,10 @@ def _of_corpus(arguments: argparse.Namespace) -> output.CommandResult:
 def _windows(
     arguments: argparse.Namespace,
     source: "adapters.Source",
-    tracks: "Sequence[BoxTrack]",
-    passes: "Sequence[PassLabel]",
+    tracks: Sequence["BoxTrack"],
+    passes: Sequence["PassLabel"],
     file: str,
-) -> "list[tuple[object, ...]]":
+) -> list[tuple[object, ...]]:
     import numpy as np
 
     from worldstate.adapters.audio.sound_file import open_sound

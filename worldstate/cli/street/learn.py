@@ -20,6 +20,7 @@ Examples
 
 import argparse
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,8 +76,6 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
 
 def _known(arguments: argparse.Namespace) -> "LearnedStreet":
-    from dataclasses import replace
-
     from worldstate.operations.labelling.street_passes import read_street
     from worldstate.smoothing.learned_street import DAY_S, LearnedStreet, forgotten
 
@@ -86,8 +85,6 @@ def _known(arguments: argparse.Namespace) -> "LearnedStreet":
 
 def _seen(arguments: argparse.Namespace, path: Path) -> "WatchedRecording":
     """Return the passes of a recording."""
-    from dataclasses import replace
-
     from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.operations.labelling.street_passes import heard_street, watched_recording
 
