@@ -160,7 +160,7 @@ class HopSpectra:
         health.mask.silence(whitened)
         inside = whitened[:, self._srp]
         srp = np.concatenate([steered_power(inside, row) for row in self.beams]) * health.mask.power_scale
-        pairs = published.pair_sum_of(health.mask.cross(matrices), self._feature_beams, self._order)
+        pairs = published.pair_sum(health.mask.cross(matrices), self._feature_beams, self._order)
         pairs = pairs * health.mask.pair_scale
         mean_square = energies.sum(axis=0) / max(n_heard, 1)
         share = float(np.add.reduce(lost)) / len(lost)

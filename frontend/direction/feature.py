@@ -94,18 +94,7 @@ def feature_steering(
     return Steering.towards(array, bin_frequencies_hz(bins, sample_rate_hz, nfft), FEATURE_AZIMUTHS_RAD)
 
 
-def pair_sum(whitened: Complex64Array, steering: Steering) -> Complex128Array:
-    r"""Return the complex sum over frames, bins and microphone pairs i < j.
-
-    .. math:: S(\theta) = \sum_{t,k} \sum_{i<j}
-              \overline{a_{k,i}(\theta)}\, Z_{t,k,i}\, \overline{Z_{t,k,j}}\, a_{k,j}(\theta)
-
-    Shapes: whitened (frames, bins, M).
-    """
-    return pair_sum_of(cross_spectra(whitened.transpose(1, 0, 2)), steering)
-
-
-def pair_sum_of(
+def pair_sum(
     matrices: Complex64Array, steering: Steering, order: tuple[int, ...] | None = None
 ) -> Complex128Array:
     r"""Return the complex sum over microphone pairs i < j from cross-spectra (bins, M, M).
@@ -184,7 +173,8 @@ def published_feature(window: ArrayLike, array: MicrophoneArray, sample_rate_hz:
     length = len(whitened) // FEATURE_SEGMENTS
     with one_blas_thread():
         steering = feature_steering(array, bins, rate, nfft)
-        sums = [pair_sum(whitened[i * length :][:length], steering) for i in range(FEATURE_SEGMENTS)]
+        parts = (whitened[i * length :][:length].transpose(1, 0, 2) for i in range(FEATURE_SEGMENTS))
+        sums = [pair_sum(cross_spectra(part), steering) for part in parts]
     return np.concatenate([segment_feature(s[None], length, len(bins), array.n_microphones) for s in sums])
 
 

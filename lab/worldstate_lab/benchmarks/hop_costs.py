@@ -19,9 +19,10 @@ from worldstate import Measurement, Present, Sighting, SignatureEvidence, WorldF
 from worldstate.abduction.road_users import DomainGuard
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters import acoustic
-from worldstate.frontend import hop_spectra, stream
+from worldstate.frontend import hop_spectra
 from worldstate.frontend.approach.tone import ToneStage
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.frontend.direction import bearing, feature
 from worldstate.frontend.health.channel_monitor import ChannelMonitor
 from worldstate.frontend.hop_spectra import LevelMeter
 from worldstate.frontend.spectra.stft import StreamingStft
@@ -38,8 +39,8 @@ FRONT_END: Stages = {
     "stft": ((StreamingStft, "push"),),
     "phat": ((hop_spectra, "power"), (hop_spectra, "whiten")),
     "srp181": ((hop_spectra, "steered_power"), (FrontEnd, "_srp")),
-    "feature": ((hop_spectra, "cross_spectra"), (hop_spectra, "pair_sum_of"), (FrontEnd, "_feature")),
-    "peaks": ((stream, "find_peaks"),),
+    "feature": ((hop_spectra, "cross_spectra"), (feature, "pair_sum"), (FrontEnd, "_feature")),
+    "peaks": ((bearing, "find_peaks"),),
     "bands": ((LevelMeter, "push"),),
     "looming": ((FrontEnd, "_looming"),),
     "tone": ((ToneStage, "push"), (ToneStage, "read")),
