@@ -151,13 +151,10 @@ def test_a_spread_finer_than_the_grid_still_finds_its_speed(speed):
     assert np.isfinite(answer.evidence.log_likelihoods).all()
 
 
-def test_tyre_noise_at_the_reference_speed_is_the_directive_s():
+def test_tyre_noise_is_that_of_the_directive_and_constant_below_its_speeds():
     """Category 1 of Directive 2015/996 at 70 km/h, 125 Hz and 1 kHz: A_R and A_P, power-summed."""
     low, high = (10.0 * math.log10(10.0**a + 10.0**b) for a, b in ((8.57, 8.92), (9.73, 8.42)))
     assert tyre_noise_shape().expected([70.0 / 3.6])[0, 0] == pytest.approx(high - low, abs=0.02)
-
-
-def test_tyre_noise_is_constant_below_the_speeds_of_the_directive():
     slow, slower = tyre_noise_shape().expected([20.0 / 3.6 - 0.5, 1.0])[0]
     assert slow == pytest.approx(slower, abs=0.1)
 

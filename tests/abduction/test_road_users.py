@@ -49,9 +49,7 @@ def test_a_class_recovers_from_a_share_of_zero() -> None:
 
 
 @given(st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3), st.floats(-5.0, 5.0), st.floats(0.05, 0.999))
-def test_the_likeliest_set_is_minimal_and_a_siren_keeps_its_odds(
-    parts: list[float], log_odds: float, mass: float
-) -> None:
+def test_the_likeliest_set_is_minimal_and_a_siren_keeps_its_odds(parts, log_odds, mass):
     shares = tuple(zip(sorted(CLASSES), (np.array(parts) / sum(parts)).tolist(), strict=True))
     chosen, by_name = likeliest(shares, mass), dict(shares)
     assert sum(by_name[name] for name in chosen) >= mass - 1e-9
@@ -121,9 +119,7 @@ levels = st.floats(-20.0, 20.0)
 
 
 @given(levels, levels, levels, levels, st.floats(0.0, 10.0))
-def test_flagged_evidence_shrinks_by_the_margin_towards_neutral(
-    left: float, right: float, visible: float, none: float, margin: float
-) -> None:
+def test_flagged_evidence_shrinks_by_the_margin_towards_neutral(left, right, visible, none, margin):
     evidence = SignatureEvidence(("left", "right"), (left, right), visible, none)
     flagged = neutral(evidence, margin)
     assert (flagged.visible, flagged.none) == (visible, none)

@@ -1,4 +1,4 @@
-"""Sequence models: causal and symmetric inputs, times to visible, hop by hop as over a whole stream."""
+"""Sequence models: symmetric inputs, times to visible, hop by hop as over a whole stream."""
 
 import json
 
@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from made_up_sequence import column, evidence_of, sequence_model
 from scipy.linalg import expm
 
-from worldstate.abduction.sequence.markov_chain import at_prior, balanced, transitions
-from worldstate.abduction.sequence.sequence_inputs import INPUTS, MEMORY_HOPS, RECENT_HOPS, sequence_inputs
+from worldstate.abduction.sequence.markov_chain import balanced, transitions
+from worldstate.abduction.sequence.sequence_inputs import INPUTS, sequence_inputs
 from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
     HORIZONS_S,
@@ -28,33 +28,12 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 @given(SEEDS)
 @settings(max_examples=20)
-def test_inputs_are_causal(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    whole = evidence_of(rng, 80)
-    np.testing.assert_array_equal(sequence_inputs(whole)[:50], sequence_inputs(whole[:50]))
-
-
-@given(SEEDS)
-@settings(max_examples=20)
 def test_inputs_of_the_mirrored_street_exchange_the_sides(seed: int) -> None:
     here = evidence_of(np.random.default_rng(seed), 60)
     there = here.copy()
     there[:, [column("left"), column("right")]] = here[:, [column("right"), column("left")]]
     there[:, column("bearing")] *= -1.0
     np.testing.assert_allclose(sequence_inputs(there), sequence_inputs(here)[:, ::-1], atol=1e-12)
-
-
-@given(SEEDS)
-@settings(max_examples=20)
-def test_inputs_use_eight_seconds_of_history_except_for_levels(seed: int) -> None:
-    whole = evidence_of(np.random.default_rng(seed), 120)
-    own = {"level", "loudness", "band_1", "band_2", "band_3", "band_4"}
-    kept = np.array([name not in own and not name.endswith("_above") for name in INPUTS])
-    # Only the last inputs, about passed vehicles, use more than three seconds of history.
-    recent = kept & (np.arange(len(INPUTS)) < INPUTS.index("since_loudest"))
-    last = sequence_inputs(whole)[-1]
-    for hops, same in ((MEMORY_HOPS, kept), (RECENT_HOPS, recent)):
-        np.testing.assert_allclose(last[:, same], sequence_inputs(whole[-hops:])[-1][:, same], atol=1e-9)
 
 
 def test_inputs_show_a_second_rise_after_the_loudest_hop() -> None:
@@ -96,10 +75,6 @@ def test_probabilities_rise_with_the_horizon_and_times_are_ordered(seed: int) ->
     assert within.shape == (20, 2, len(HORIZONS_S)) and (np.diff(within, axis=-1) >= -1e-12).all()
     assert (within >= 0.0).all() and (within <= 1.0 + 1e-12).all()
     assert (times[..., 0] <= times[..., 2]).all() and (times[..., 0] >= 0.0).all()
-    sure = np.zeros((1, 2, len(GROUPS)))
-    sure[..., GROUPS.index("coming_1.5s")] = 1.0
-    low, best, high = SequencePosterior(sure, 0.0).time_to_visible_s()[0, 0]
-    assert (best, round(low, 3), round(high, 3)) == (1.25, 1.025, 1.475)
 
 
 @pytest.mark.parametrize("hops", [0, 1, 2])
@@ -151,7 +126,6 @@ def test_hop_by_hop_gives_the_posterior_of_the_whole_stream(seed: int, hops: int
         if number < 9:
             assert isinstance(reading, NotUsable)
         else:
-            assert isinstance(reading, SequenceReading)
             np.testing.assert_array_equal(reading.groups, said[number])
 
 
@@ -185,17 +159,8 @@ def test_a_balanced_chain_keeps_its_distribution_and_two_steps_are_one(seed: int
 
 
 @given(SEEDS, st.integers(1, 22), st.floats(-4.0, 2.0), st.integers(1, 10**10))
-def test_a_step_is_the_matrix_exponential_of_its_rates(
-    seed: int, states: int, scale: float, step_ns: int
-) -> None:
+def test_a_step_is_the_matrix_exponential_of_its_rates(seed, states, scale, step_ns):
     rates_hz = np.random.default_rng(seed).exponential(10.0**scale, (states, states))
     np.fill_diagonal(rates_hz, 0.0)
     np.fill_diagonal(rates_hz, -rates_hz.sum(axis=1))
     np.testing.assert_allclose(transitions(rates_hz, step_ns), expm(rates_hz * (step_ns / 1e9)), atol=1e-11)
-
-
-@given(SEEDS)
-def test_a_change_of_prior_is_reversible(seed: int) -> None:
-    share, prior, said = 0.9 * np.random.default_rng(seed).dirichlet(np.ones(5), 3) + 0.02
-    there = at_prior(said, share, prior)
-    np.testing.assert_allclose(at_prior(there, prior, share), said / said.sum(), atol=1e-12)

@@ -1,4 +1,4 @@
-"""Learning a site while running: the weighted mean, its limits and its effect on real windows."""
+"""Learning a site while running: the weighted mean, its limits and checkpoints."""
 
 import json
 from dataclasses import replace
@@ -7,19 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from released_data import FOLDER
-from released_data import TABLE as NAME
 
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.signature.ensemble import mirror_features, site_reference
 from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings, SiteSignature
-from worldstate.abduction.signature.window_classes import hazard_statistic
-from worldstate.adapters.datasets.feature_table import read_features
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
-from worldstate.operations.training.site_references import with_site_references
-from worldstate.operations.training.training import fit_ensemble, folds_by_recording, out_of_fold
 
 SETTINGS = SiteEstimateSettings()
 
@@ -95,67 +88,3 @@ def test_a_refused_window_leaves_the_estimate_unchanged(model, bad):
     with pytest.raises(InvalidArgumentError):
         signature.evidence(bad)
     assert signature.estimate.heard_s == 0.0
-
-
-TABLE = FOLDER and FOLDER / NAME
-real = pytest.mark.skipif(
-    TABLE is None, reason="extracted_features.csv neither where OVAD_FEATURES points nor in ../shared/ovad"
-)
-
-
-def stream_of(table, here, rng, hops=600):
-    """Rows of a stream at a junction, 19 of 20 of them hazard-free."""
-    none, hazard = (np.flatnonzero(here & flags) for flags in (table.hazard_free, table.hazards))
-    return np.where(rng.random(hops) < 0.95, rng.choice(none, hops), rng.choice(hazard, hops))
-
-
-def rates(table, prepared, train, here, rng):
-    """Return decisions with and without the learned site, at an out-of-fold threshold, and labels."""
-    known = prepared.select(train)
-    model, folds = fit_ensemble(known), folds_by_recording(known, rng)
-    (inner,) = out_of_fold(known, folds, fit_ensemble, [lambda one, rows: one.explain(known.features[rows])])
-    gamma = neyman_pearson_threshold(list(hazard_statistic(inner, 0.0)[known.hazard_free][:, None]), 0.02)
-    estimate, decisions = SiteEstimate.start(60), []
-    rows = stream_of(table, here, rng)
-    for row in rows:
-        reference = estimate.reference(model)
-        window = table.features[row]
-        both = np.stack([np.concatenate([window, r]) for r in (reference, model.home)])
-        decisions.append(hazard_statistic(model.predict_proba(both), 0.0) >= gamma)
-        # Independent one-second windows, one per second.
-        estimate = estimate.updated(window, 1.0, SETTINGS)
-    return np.array(decisions), table.hazards[rows]
-
-
-def pooled_rates(group, seen, seed=0):
-    table = read_features(TABLE).group(group)
-    prepared, rng = with_site_references(table), np.random.default_rng(seed)
-    parts = []
-    for junction in np.unique(table.environments):
-        here = table.environments == junction
-        if seen:
-            keys = np.unique(table.recording_keys[here])
-            here &= np.isin(table.recording_keys, rng.permutation(keys)[: len(keys) // 2])
-        parts.append(rates(table, prepared, ~here, here, rng))
-    decisions, hazards = (np.concatenate(part) for part in zip(*parts, strict=True))
-    on, off = decisions.T
-    return on[hazards].mean(), on[~hazards].mean(), off[hazards].mean(), off[~hazards].mean()
-
-
-@pytest.mark.long
-@pytest.mark.slow
-@real
-@pytest.mark.parametrize("seen", [False, True])
-def test_learning_an_empty_street_costs_a_standing_ego_no_detections(seen):
-    hits, false, hits_off, false_off = pooled_rates("static", seen)
-    assert hits >= hits_off - 0.05
-    assert false <= false_off + 0.02
-
-
-@pytest.mark.long
-@pytest.mark.slow
-@real
-def test_learning_a_new_junction_halves_false_alarms_of_a_moving_ego():
-    hits, false, hits_off, false_off = pooled_rates("dynamic", seen=False)
-    assert hits >= hits_off - 0.05
-    assert false <= false_off / 2

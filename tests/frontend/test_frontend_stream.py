@@ -3,7 +3,6 @@
 import gc
 import os
 import sys
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plane_waves import noise_from
 
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
@@ -28,17 +28,6 @@ from worldstate.ground.values import NotUsable, wrap_angle
 SQUARE = MicrophoneArray([[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]])
 RATE = 16_000
 EVERYTHING = FrontEndSettings(tone_band_hz=(20.0, 400.0))
-
-
-def noise_from(
-    array: MicrophoneArray, azimuth_rad: float, rate: int, seconds: float, seed: int = 0, noise: float = 0.1
-) -> np.ndarray:
-    """A white plane wave with exact fractional delays in sensor noise, float32 (n, M)."""
-    rng, n = np.random.default_rng(seed), round(seconds * rate)
-    wave = np.fft.rfft(rng.standard_normal(n))[:, None]
-    wave = wave * array.steering(np.fft.rfftfreq(n, 1 / rate), azimuth_rad)[:, :, 0]
-    sensor = noise * rng.standard_normal((n, array.n_microphones))
-    return (np.fft.irfft(wave, n, axis=0) + sensor).astype(np.float32)
 
 
 def assert_same(ours: list[AcousticFrame], theirs: list[AcousticFrame], rtol: float = 1e-5) -> None:
@@ -59,19 +48,17 @@ def assert_same(ours: list[AcousticFrame], theirs: list[AcousticFrame], rtol: fl
 def test_block_size_does_not_matter(cuts: list[int], rate: float) -> None:
     sound = noise_from(SQUARE, 0.5, RATE, 1.25)
     sound += np.sin(2 * np.pi * 61.0 / RATE * np.arange(len(sound)), dtype=np.float32)[:, None]
+    sound[14_000:14_100] = sound[:, 3] = 0.0
     whole = FrontEnd(SQUARE, rate, EVERYTHING).process(sound)
-    pieces = FrontEnd(SQUARE, rate, EVERYTHING)
+    front_end = FrontEnd(SQUARE, rate, EVERYTHING)
     blocks = np.split(sound, sorted(min(c, len(sound)) for c in cuts))
-    assert_same([frame for block in blocks for frame in pieces.process(block)], whole)
+    pieces = [frame for block in blocks for frame in front_end.process(block)]
+    assert_same(pieces, whole)
+    reports = [
+        [(f.health.faults, f.health.dropouts, f.health.coherence) for f in one] for one in (pieces, whole)
+    ]
+    assert reports[0] == reports[1] and whole[-1].health.n_dropouts == len(whole[-1].health.faults) == 1
     assert isinstance(whole[-1].tone, ToneReading)
-
-
-def test_sample_by_sample_is_the_same_too() -> None:
-    sound = noise_from(SQUARE, 0.5, 8_000, 1.15)
-    front_end = FrontEnd(SQUARE, 8_000)
-    frames = [frame for sample in sound for frame in front_end.process(sample[None])]
-    assert len(frames) == 2
-    assert_same(frames, FrontEnd(SQUARE, 8_000).process(sound))
 
 
 def test_hops_do_not_drift_at_the_recordings_odd_rate() -> None:
@@ -81,13 +68,6 @@ def test_hops_do_not_drift_at_the_recordings_odd_rate() -> None:
     assert [f.sample_index for f in frames] == [int(k * 4799.8 + 0.5) for k in range(10, 41)]
     assert frames[10].stamp_ns == 5 + 2_000_000_000
     assert abs(frames[3].stamp_ns - 1_300_000_005) < 1e9 / 47_998
-
-
-def test_nothing_before_the_first_full_second() -> None:
-    front_end = FrontEnd(SQUARE, RATE)
-    sound = noise_from(SQUARE, 0.2, RATE, 1.0)
-    assert front_end.process(sound[:-1]) == []
-    assert len(front_end.process(sound[-1:])) == 1
 
 
 @pytest.mark.long
@@ -103,23 +83,12 @@ def test_bearing_of_a_plane_wave(layout: str, azimuth_deg: float, rate: int) -> 
     assert frame.bearing_std_rad < np.radians(12)
 
 
-def test_the_square_frame_has_the_promised_shapes() -> None:
-    frame = FrontEnd(SQUARE, RATE).process(noise_from(SQUARE, 0.2, RATE, 1.0))[0]
-    assert frame.srp.shape == frame.azimuths_rad.shape == (181,)
-    assert frame.band_log_energy.shape == (16,)
-    assert frame.feature.shape == (60,)
-    assert frame.azimuths_rad[0] == -np.pi / 2
-    assert np.all(np.diff(frame.azimuths_rad) > 0)
-
-
 @settings(deadline=None, max_examples=10)
-@given(gain=st.floats(1e-3, 1e3), seed=st.integers(0, 1000))
-def test_a_gain_changes_neither_bearing_nor_looming(gain: float, seed: int) -> None:
-    sound = noise_from(SQUARE, 0.5, RATE, 1.0, seed)
-    plain, louder = (FrontEnd(SQUARE, RATE).process(s)[0] for s in (sound, sound * np.float32(gain)))
+@given(exponent=st.floats(-3.0, 13.0), seed=st.integers(0, 1000))
+def test_a_gain_changes_neither_bearing_nor_looming(exponent: float, seed: int) -> None:
+    sound, gain = noise_from(SQUARE, 0.5, RATE, 1.0, seed), np.float32(10.0**exponent)
+    plain, louder = (FrontEnd(SQUARE, RATE).process(s)[0] for s in (sound, sound * gain))
     assert louder.bearing_rad == pytest.approx(plain.bearing_rad, abs=1e-5)
-    assert isinstance(plain.looming, Looming)
-    assert isinstance(louder.looming, Looming)
     assert louder.looming.inverse_tta_hz == pytest.approx(plain.looming.inverse_tta_hz, abs=1e-5)
     np.testing.assert_allclose(louder.band_log_energy - plain.band_log_energy, 2 * np.log(gain), atol=1e-4)
 
@@ -148,16 +117,12 @@ def test_several_sources_are_several_peaks() -> None:
 
 
 def test_looming_on_an_approaching_source_in_the_stream() -> None:
-    n = 2 * RATE
-    time_s = np.arange(n) / RATE
-    range_m = 30.0 - 10.0 * time_s
+    range_m = 30.0 - 10.0 * np.arange(2 * RATE) / RATE
     sound = noise_from(SQUARE, 0.0, RATE, 2.0, noise=0.0) / range_m[:, None].astype(np.float32)
     frames = FrontEnd(SQUARE, RATE).process(sound)
-    errors = []
-    for frame in frames:
-        assert isinstance(frame.looming, Looming)
-        truth = 10.0 / (30.0 - 10.0 * frame.sample_index / RATE)
-        errors.append((frame.looming.inverse_tta_hz - truth) / frame.looming.std_hz)
+    truths = (10.0 / (30.0 - 10.0 * frame.sample_index / RATE) for frame in frames)
+    found = [frame.looming for frame in frames]
+    errors = [(one.inverse_tta_hz - truth) / one.std_hz for one, truth in zip(found, truths, strict=True)]
     assert np.abs(np.mean(errors)) < 1.5
     assert np.abs(errors).max() < 3.0
 
@@ -204,14 +169,6 @@ def test_a_refused_block_leaves_the_stream_as_it_was() -> None:
     assert_same(front_end.process(sound[5000:]), FrontEnd(SQUARE, RATE).process(sound))
 
 
-@pytest.mark.parametrize("scale", [2.0**31, 1e13])
-def test_loud_sound_gives_finite_features(scale: float) -> None:
-    sound = noise_from(SQUARE, 0.5, RATE, 1.0)
-    frame = FrontEnd(SQUARE, RATE).process(sound * np.float32(scale))[0]
-    assert np.isfinite(frame.band_log_energy).all()
-    assert isinstance(frame.looming, Looming)
-
-
 def hear(front_end: FrontEnd, sound: np.ndarray, hops: int, rounds: int = 1) -> None:
     """Process hops of a sound with some gaps and dead channels; every round is the same."""
     size = round(front_end.sample_rate_hz / 10)
@@ -229,24 +186,6 @@ def hear(front_end: FrontEnd, sound: np.ndarray, hops: int, rounds: int = 1) -> 
 
 def resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow() -> None:
-    """With all options on, 1,500 hops leave no objects behind."""
-    chosen = replace(EVERYTHING, nfft=256)
-    front_end, sound = FrontEnd(SQUARE, 4_000, chosen), noise_from(SQUARE, 0.5, 4_000, 20.0)
-    hear(front_end, sound, 770)
-    blocks = sys.getallocatedblocks()
-    hear(front_end, sound, 770, rounds=2)
-    assert sys.getallocatedblocks() - blocks < 500
-    tracemalloc.start()
-    hear(front_end, sound, 77)
-    traced = tracemalloc.get_traced_memory()[0]
-    hear(front_end, sound, 77, rounds=2)
-    grown = tracemalloc.get_traced_memory()[0] - traced
-    tracemalloc.stop()
-    assert grown < 12_000
 
 
 @pytest.mark.slow
@@ -282,9 +221,7 @@ def lose(sound: np.ndarray, first: int, length: int, value: float = 0.0) -> np.n
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(1, 6), st.integers(0, 1580), st.integers(32, 8000), st.sampled_from([0.0, 0.3, -1.0]))
-def test_a_window_with_lost_samples_is_the_mean_over_its_other_frames(
-    hop: int, offset: int, length: int, value: float
-) -> None:
+def test_a_window_with_lost_samples_is_the_mean_over_its_other_frames(hop, offset, length, value):
     # A run needs more than 16 samples, so the offset leaves out the end of a hop.
     rate, sound, first = 16_000, noise_from(SQUARE, 0.5, 16_000, 1.3), 1600 * hop + offset
     frame = FrontEnd(SQUARE, rate).process(lose(sound, first, length, value))[2]
@@ -338,9 +275,7 @@ LEVELS = st.lists(st.floats(-20.0, -5.0), min_size=BANDS, max_size=BANDS)
 
 @settings(max_examples=30)
 @given(LEVELS, st.floats(-5.0, 5.0), st.floats(0.01, 1.0), st.lists(st.floats(-0.2, 0.2), max_size=40))
-def test_a_street_that_changes_slowly_is_never_masked(
-    levels: list[float], gain: float, coherence: float, steps: list[float]
-) -> None:
+def test_a_street_that_changes_slowly_is_never_masked(levels, gain, coherence, steps):
     """Up to 0.9 dB per hop and 35 dB in all, at any level, if the coherence is as usual."""
     meter, level = NoiseMeter(), np.array(levels) + gain
     for step in (0.0, *steps, *([0.2] * 10)):
@@ -350,9 +285,7 @@ def test_a_street_that_changes_slowly_is_never_masked(
 
 @settings(max_examples=30)
 @given(LEVELS, st.floats(2.5, 6.0), st.integers(1, 30), st.floats(-5.0, 5.0), st.booleans())
-def test_a_burst_of_noise_is_masked_until_it_ends_at_any_gain(
-    levels: list[float], nats: float, hops: int, gain: float, incoherent: bool
-) -> None:
+def test_a_burst_of_noise_is_masked_until_it_ends_at_any_gain(levels, nats, hops, gain, incoherent):
     meter, level = NoiseMeter(), np.array(levels) + gain
     assert {meter.push(level, 0.5) for _ in range(50)} == {(1.0, None)}
     burst = [meter.push(level + nats, 0.1 if incoherent else 0.5) for _ in range(hops)]

@@ -1,9 +1,7 @@
-"""The engine line of a stream: decimation, the fit against its bound, and readings that are not usable."""
+"""The engine line of a stream: the fit against its bound, and readings that are not usable."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from worldstate.frontend.approach.tone import ToneReading, ToneStage
 from worldstate.frontend.array.microphone_array import ChannelMask, MicrophoneArray, roof_array_56
@@ -37,29 +35,6 @@ def on_both(sound: np.ndarray) -> np.ndarray:
     return np.stack([sound, sound], axis=1).astype(np.float32)
 
 
-@settings(deadline=None, max_examples=40)
-@given(
-    cuts=st.lists(st.integers(0, 6000), max_size=8),
-    rate=st.sampled_from([1_000, 2_500.0, 8_000, 47_998]),
-    share=st.floats(0.0, 1.0),
-)
-def test_decimation_keeps_the_band_where_it_was(cuts: list[int], rate: float, share: float) -> None:
-    """A tone in the band comes out as itself, sampled at the promised instants, whatever the blocks."""
-    decimator, frequency = Decimator(rate, 300.0), 300.0 * share
-    sound = line(frequency, 6000 / rate, rate)
-    heard = np.concatenate([decimator.push(block) for block in np.split(sound, sorted(cuts))])
-    assert len(heard) == (6000 - decimator.n_taps) // decimator.factor + 1
-    instants = (np.arange(len(heard)) * decimator.factor + 0.5 * (decimator.n_taps - 1)) / rate
-    np.testing.assert_allclose(heard, np.cos(2 * np.pi * frequency * instants + 0.3), atol=3e-4)
-
-
-@pytest.mark.parametrize("frequency_hz", [835.0, 1230.0, 1500.0, 5000.0, 23_000.0])
-def test_decimation_leaves_no_aliases_in_the_band(frequency_hz: float) -> None:
-    decimator = Decimator(RATE, 400.0)
-    assert decimator.rate_hz - 400.0 < 835.0
-    assert np.abs(decimator.push(line(frequency_hz, 0.5, RATE))).max() < 2e-4
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("low_hz", "high_hz"), [(20.5, 24.0), (25.0, 390.0), (390.0, 399.0)])
 @pytest.mark.parametrize("snr_db", [-6.0, 10.0, 35.0])
@@ -76,7 +51,6 @@ def test_variance_meets_the_decimated_bound(snr_db: float, low_hz: float, high_h
         sound = line(frequency, 1.0, RATE, rng.uniform(-3.1, 3.1)) + noise * rng.standard_normal(RATE)
         stage.push(on_both(sound), BOTH)
         reading = stage.read()
-        assert isinstance(reading, ToneReading)
         errors.append(reading.frequency_hz - frequency)
         claimed.append(reading.frequency_std_hz**2)
     bound = tone_crb_hz2(eta, len(stage._band_samples), rate)
@@ -132,7 +106,6 @@ def test_a_weak_line_is_found_beside_rumble() -> None:
     stage = ToneStage(PAIR, RATE)
     stage.push(on_both(rumble + 2.0 + 0.03 * line(151.7, 2.0, RATE)), BOTH)
     reading = stage.read()
-    assert isinstance(reading, ToneReading)
     assert abs(reading.frequency_hz - 151.7) < 4 * reading.frequency_std_hz < 0.2
 
 
@@ -145,7 +118,6 @@ def test_a_stream_has_a_tone_reading_per_hop() -> None:
     frames = FrontEnd(PAIR, rate, SETTINGS).process(on_both(glide + noise))
     assert len(frames) == 11
     for frame in frames:
-        assert isinstance(frame.tone, ToneReading)
         middle_s = frame.sample_index / rate - 0.5
         assert frame.tone.frequency_hz == pytest.approx(100.0 + 0.4 * middle_s, abs=0.01)
 
@@ -158,7 +130,6 @@ def test_a_line_is_found_from_any_direction(azimuth_deg: float) -> None:
     stage = ToneStage(array, 8_000)
     stage.push(np.cos(2 * np.pi * f * (t - delays)).astype(np.float32), ChannelMask.all_of(56))
     reading = stage.read()
-    assert isinstance(reading, ToneReading)
     assert reading.frequency_hz == pytest.approx(f, abs=1e-4)
 
 
@@ -168,7 +139,6 @@ def test_masked_microphones_have_no_effect_on_the_tone() -> None:
     stage = ToneStage(PAIR, 8_000)
     stage.push(sound, ChannelMask(np.array([True, False])))
     reading = stage.read()
-    assert isinstance(reading, ToneReading)
     assert reading.frequency_hz == pytest.approx(90.0, abs=1e-3)
 
 
@@ -186,5 +156,4 @@ def test_level_does_not_matter(scale: float) -> None:
     stage = ToneStage(PAIR, 8_000)
     stage.push(on_both(scale * line(90.0, 1.0, 8_000)), BOTH)
     reading = stage.read()
-    assert isinstance(reading, ToneReading)
     assert reading.frequency_hz == pytest.approx(90.0, abs=1e-4)

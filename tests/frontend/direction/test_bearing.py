@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from plane_waves import plane_wave
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.bearing import AcousticBearing, BearingScatter
@@ -23,10 +24,8 @@ SPREAD = {
 
 def wave(array: MicrophoneArray, azimuth_deg: float, elevation_deg: float, n: int, seed: int) -> FloatArray:
     """White plane wave of unit power, (n, M)."""
-    spectrum = np.fft.rfft(np.random.default_rng(seed).standard_normal(n))
-    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
-    steering = array.steering(np.fft.rfftfreq(n, 1 / RATE), azimuth, elevation)[:, :, 0]
-    return np.asarray(np.fft.irfft(spectrum[:, None] * steering, n, axis=0))
+    sound = np.random.default_rng(seed).standard_normal(n)
+    return plane_wave(array, sound, np.radians(azimuth_deg), RATE, np.radians(elevation_deg))
 
 
 def diffuse(array: MicrophoneArray, seconds: int, seed: int) -> FloatArray:

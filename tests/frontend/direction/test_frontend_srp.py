@@ -5,6 +5,7 @@ import pyroomacoustics
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plane_waves import noise_from
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.array.steering import Steering
@@ -23,18 +24,6 @@ def beams(array: MicrophoneArray, rate: float = 48_000.0) -> Steering:
     return Steering.towards(array, bin_frequencies_hz(band_bins(BAND, rate, 512), rate, 512), AZIMUTHS)
 
 
-def random_frames(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
-
-
-def noise_from(array: MicrophoneArray, azimuth_rad: float, rate: float, seed: int) -> np.ndarray:
-    """One second of a white plane wave in a little sensor noise, exact fractional delays, float32 (n, M)."""
-    rng, n = np.random.default_rng(seed), int(rate)
-    wave = np.fft.rfft(rng.standard_normal(n))[:, None]
-    wave = wave * array.steering(np.fft.rfftfreq(n, 1 / rate), azimuth_rad)[:, :, 0]
-    return (np.fft.irfft(wave, n, axis=0) + 0.1 * rng.standard_normal((n, array.n_microphones))).astype("f4")
-
-
 @pytest.mark.parametrize("rate", [47_998.0, 16_000.0])
 @pytest.mark.parametrize("layout", ["roof", "square", "line", "solid"])
 def test_equals_pyroomacoustics_on_the_same_frames(layout: str, rate: float) -> None:
@@ -45,9 +34,8 @@ def test_equals_pyroomacoustics_on_the_same_frames(layout: str, rate: float) -> 
         "solid": np.random.default_rng(5).uniform(-0.3, 0.3, (9, 3)),
     }
     array = MicrophoneArray(layouts[layout])
-    frames = StreamingStft(array.n_microphones, 512, range(0, 257)).push(
-        noise_from(array, 0.3, rate, 0)[:4800]
-    )
+    sound = noise_from(array, 0.3, rate, 4800 / rate)
+    frames = StreamingStft(array.n_microphones, 512, range(0, 257)).push(sound)
     peer = pyroomacoustics.doa.SRP(array.positions_m.T, rate, 512, c=343.0, azimuth=AZIMUTHS)
     peer.locate_sources(frames.transpose(2, 1, 0).astype(np.complex128), freq_range=list(BAND))
     bins = band_bins(BAND, rate, 512)
@@ -69,30 +57,11 @@ def test_a_lone_plane_wave_scores_one_where_it_comes_from(azimuth: float, seed: 
     assert spectrum[1] >= spectrum.max()
 
 
-@given(st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=25)
-def test_microphone_order_does_not_matter(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    array = random_array(rng)
-    order = rng.permutation(6)
-    frames = random_frames(rng, (9, 16, 6))
-    shuffled = srp_phat(frames[:, :, order], beams(MicrophoneArray(array.positions_m[order])))
-    np.testing.assert_allclose(shuffled, srp_phat(frames, beams(array)), rtol=1e-5)
-
-
-def test_independent_noise_scores_one_over_m() -> None:
-    frames = random_frames(np.random.default_rng(0), (4000, 16, 6))
-    spectrum = srp_phat(frames, beams(random_array(np.random.default_rng(1))))
-    np.testing.assert_allclose(spectrum, 1 / 6, rtol=0.02)
-
-
 @pytest.mark.parametrize("azimuth_deg", [-70.0, -20.4, 0.3, 33.7, 60.0])
 def test_bearing_is_finer_than_the_grid(azimuth_deg: float) -> None:
     array = roof_array_56()
-    sound = noise_from(array, np.radians(azimuth_deg), 47_998.0, 3)
+    sound = noise_from(array, np.radians(azimuth_deg), 47_998.0, 1.0, 3)
     bins = band_bins(BAND, 47_998, 512)
     spectrum = srp_phat(StreamingStft(56, 512, bins).push(sound), beams(array, 47_998.0))
-    tolerance_deg = 0.1 / np.cos(np.radians(azimuth_deg))
-    assert np.degrees(find_peaks(spectrum, AZIMUTHS)[0].azimuth_rad) == pytest.approx(
-        azimuth_deg, abs=tolerance_deg
-    )
+    found_deg = np.degrees(find_peaks(spectrum, AZIMUTHS)[0].azimuth_rad)
+    assert abs(found_deg - azimuth_deg) < 0.1 / np.cos(np.radians(azimuth_deg))

@@ -74,21 +74,15 @@ def _projector(subspace: Subspace):
     return subspace.vectors @ subspace.vectors.conj().transpose(0, 2, 1)
 
 
-@pytest.mark.parametrize("truth", [0, 1, 2, 3])
-def test_number_of_sources(truth):
-    rng = np.random.default_rng(truth)
-    positions, hits = plate(12, rng), 0
-    for _ in range(40):
-        X = heard(positions, np.deg2rad([-50, 10, 45][:truth]), rng, 100, snr=0.5)
-        values = np.linalg.eigvalsh(covariance(X))
-        hits += count_sources(values, 100) == truth
-    assert hits >= 36
-
-
-def test_number_of_sources_with_fewer_frames_than_microphones():
-    rng = np.random.default_rng(9)
-    positions, counts = plate(56, rng), []
-    for truth in [0, 1, 2] * 10:
-        X = heard(positions, np.deg2rad([-40, 30][:truth]), rng, 19, snr=0.5)
-        counts.append(count_sources(np.linalg.eigvalsh(covariance(X)), 19) - truth)
-    assert np.mean(np.array(counts) == 0) >= 0.9
+@pytest.mark.parametrize(
+    ("microphones", "frames", "truths", "azimuths_deg"),
+    [*((12, 100, [truth] * 40, (-50, 10, 45)) for truth in range(4)), (56, 19, [0, 1, 2] * 10, (-40, 30))],
+)
+def test_number_of_sources(microphones, frames, truths, azimuths_deg):
+    """Also with fewer frames than microphones."""
+    rng = np.random.default_rng(truths[-1])
+    positions, hits = plate(microphones, rng), 0
+    for truth in truths:
+        X = heard(positions, np.deg2rad(azimuths_deg[:truth]), rng, frames, snr=0.5)
+        hits += count_sources(np.linalg.eigvalsh(covariance(X)), frames) == truth
+    assert hits >= 0.9 * len(truths)

@@ -1,21 +1,18 @@
 """Faulty microphones are found, classified and left out; healthy arrays raise no fault."""
 
-import gc
-import tracemalloc
-from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plane_waves import noise_from
 
-from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.health.channel_health import ArrayHealth, DropoutFinder
 from worldstate.frontend.health.channel_monitor import ClippingCounter
 from worldstate.frontend.settings import FrontEndSettings
-from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.values import NotUsable
 from worldstate.simulation import draw_settings, simulate_recording
 
@@ -54,88 +51,61 @@ def named(health: ArrayHealth) -> dict[str, list[int]]:
     return kinds
 
 
-def silence(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, [3, 17]] = [0.0, 0.4]
+def spoil(x: np.ndarray, kind: str, rng: np.random.Generator) -> None:
+    """Give some of 28 channels a fault, in place."""
+    match kind:
+        case "constant":
+            x[:, [3, 17]] = [0.0, 0.4]
+        case "nearly dead":
+            x[:, 5] = 1e-3 * rng.standard_normal(len(x))
+        case "interrupted":
+            for start in (20_000, 33_000, 41_000):
+                x[start : start + 1200, 9] = 0.0
+        case "crackling":
+            for start in range(17_000, 55_000, 7000):
+                x[start : start + 20, 11] += 40 * rng.standard_normal(20)
+        case "noise":
+            x[:, [2, 20]] = rng.standard_normal((len(x), 2))
+        case "inverted":
+            x[:, 13] *= -1
+        case "swapped":
+            x[:, [1, 22]] = x[:, [22, 1]]
+        case "clipped":
+            x[:, 6] = x[:, 6].clip(-1.5, 1.5)
+            x[:, 25] = x[:, 25].clip(-9.0, 1.2)
+        case "offset":
+            x[:, 8] += 2.0
+        case "gain":
+            x[:, [0, 27]] *= [8.0, 0.1]
 
 
-def nearly_dead(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, 5] = 1e-3 * rng.standard_normal(len(x))
-
-
-def dropouts(x: np.ndarray, rng: np.random.Generator) -> None:
-    for start in (20_000, 33_000, 41_000):
-        x[start : start + 1200, 9] = 0.0
-
-
-def crackle(x: np.ndarray, rng: np.random.Generator) -> None:
-    for start in range(17_000, 55_000, 7000):
-        x[start : start + 20, 11] += 40 * rng.standard_normal(20)
-
-
-def noise(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, [2, 20]] = rng.standard_normal((len(x), 2))
-
-
-def inversion(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, 13] *= -1
-
-
-def swap(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, [1, 22]] = x[:, [22, 1]]
-
-
-def clip(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, 6] = x[:, 6].clip(-1.5, 1.5)
-    x[:, 25] = x[:, 25].clip(-9.0, 1.2)
-
-
-def offset(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, 8] += 2.0
-
-
-def gain(x: np.ndarray, rng: np.random.Generator) -> None:
-    x[:, 0] *= 8.0
-    x[:, 27] *= 0.1
-
-
-FAULTS: list[tuple[Callable[[np.ndarray, np.random.Generator], None], dict[str, list[int]], bool]] = [
-    (silence, {"dead": [3, 17]}, True),
-    (nearly_dead, {"dead": [5]}, True),
-    (dropouts, {"intermittent": [9]}, True),
-    (crackle, {"intermittent": [11]}, True),
-    (noise, {"noisy": [2, 20]}, True),
-    (inversion, {"inverted": [13]}, True),
-    (swap, {"swapped": [1, 22]}, True),
-    (clip, {"clipped": [6, 25]}, False),
-    (offset, {"offset": [8]}, False),
-    (gain, {"level": [0, 27]}, False),
-]
+FAULTS = {
+    "constant": ({"dead": [3, 17]}, True),
+    "nearly dead": ({"dead": [5]}, True),
+    "interrupted": ({"intermittent": [9]}, True),
+    "crackling": ({"intermittent": [11]}, True),
+    "noise": ({"noisy": [2, 20]}, True),
+    "inverted": ({"inverted": [13]}, True),
+    "swapped": ({"swapped": [1, 22]}, True),
+    "clipped": ({"clipped": [6, 25]}, False),
+    "offset": ({"offset": [8]}, False),
+    "gain": ({"level": [0, 27]}, False),
+}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("spoil", "expected", "masked"), FAULTS, ids=[f[0].__name__ for f in FAULTS])
+@pytest.mark.parametrize("kind", FAULTS)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_exactly_the_faults_present_are_found(
-    spoil: Callable[[np.ndarray, np.random.Generator], None],
-    expected: dict[str, list[int]],
-    masked: bool,
-    seed: int,
-) -> None:
+def test_exactly_the_faults_present_are_found(kind: str, seed: int) -> None:
+    expected, masked = FAULTS[kind]
     # It takes six seconds to distinguish a gain from a gust.
-    sound = street(HALF, seed, seconds=6.5 if spoil is gain else SECONDS)
-    spoil(sound, np.random.default_rng(50 + seed))
+    sound = street(HALF, seed, seconds=6.5 if kind == "gain" else SECONDS)
+    spoil(sound, kind, np.random.default_rng(50 + seed))
     last = healths(HALF, sound)[-1]
     assert named(last) == expected
     left_out = np.flatnonzero(~last.mask.keep).tolist()
     assert left_out == (next(iter(expected.values())) if masked else [])
     assert last.n_dropouts == 0
-
-
-def test_a_swap_has_the_right_channel() -> None:
-    sound = street(HALF, 3)
-    swap(sound, np.random.default_rng(0))
-    faults = healths(HALF, sound)[-1].faults
-    assert {(fault.channel, fault.looks_like) for fault in faults} == {(1, 22), (22, 1)}
 
 
 def test_several_faults_at_once_are_found() -> None:
@@ -147,13 +117,19 @@ def test_several_faults_at_once_are_found() -> None:
     sound[:, [0, 50]] = 0.0
     last = healths(ROOF, sound)[-1]
     assert named(last) == {"dead": [0, 50], "swapped": [7, 40], "inverted": [12], "noisy": [33]}
+    assert {(one.channel, one.looks_like) for one in last.faults if one.looks_like} == {(7, 40), (40, 7)}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(4))
-def test_a_clean_street_raises_no_alarm(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "levels"), [*((seed, None) for seed in range(100, 104)), *((8, levels) for levels in (2, 5, 30))]
+)
+def test_a_clean_street_raises_no_alarm(seed: int, levels: int | None) -> None:
+    """Coarse quantisation is no clipping."""
     array = (HALF, ROOF)[seed % 2]
-    sound = street(array, 100 + seed)
+    sound = street(array, seed)
+    if levels is not None:
+        sound = np.round(sound * levels).astype(np.float32)
     assert all(health.is_healthy for health in healths(array, sound))
 
 
@@ -168,13 +144,6 @@ def test_simulated_junctions_raise_no_alarm_and_show_a_swap(approach: str, seed:
     swapped = recording.audio.copy()
     swapped[:, [3, 40]] = recording.audio[:, [40, 3]]
     assert named(healths(ROOF, swapped, recording.sample_rate_hz)[-1]) == {"swapped": [3, 40]}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("levels", [2, 5, 30])
-def test_coarse_quantisation_is_no_clipping(levels: int) -> None:
-    sound = np.round(street(HALF, 8) * levels).astype(np.float32)
-    assert all(health.is_healthy for health in healths(HALF, sound))
 
 
 def test_independent_noise_is_not_classified() -> None:
@@ -203,70 +172,16 @@ def test_a_dead_channel_is_masked_at_once_and_returns() -> None:
     assert found[-1].mask.is_whole
 
 
-def moving_source(array: MicrophoneArray, seconds: float, seed: int) -> tuple[np.ndarray, Callable]:
-    """Return the sound (n, M) of a car at 10 m/s, 10 m ahead, and its azimuth at emission."""
-    from scipy.interpolate import CubicSpline
-
-    rate, c, rng = 48_000, 343.0, np.random.default_rng(seed)
-    start = -0.2
-    n = round((seconds - start) * rate)
-    spectrum = np.fft.rfft(rng.standard_normal(n))
-    spectrum[np.fft.rfftfreq(n, 1 / rate) > 5000] = 0.0
-    emitted = CubicSpline(start + np.arange(n) / rate, np.fft.irfft(spectrum, n))
-
-    def emission(t: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        te = t.copy()
-        for _ in range(5):
-            r = np.sqrt((10 - place[0]) ** 2 + (10 - 10 * te - place[1]) ** 2 + place[2] ** 2)
-            te = t - r / c
-        return te, r
-
-    time = np.arange(round(seconds * rate)) / rate
-    heard = np.empty((len(time), array.n_microphones), np.float32)
-    for m, place in enumerate(array.positions_m):
-        te, r = emission(time, place)
-        heard[:, m] = emitted(te) / r
-    heard += 0.3 * heard.std() * rng.standard_normal(heard.shape, dtype=np.float32)
-
-    def azimuth(t: float) -> float:
-        te = emission(np.array([t]), array.positions_m.mean(axis=0))[0][0]
-        return float(np.arctan2(10 - 10 * te, 10.0))
-
-    return heard, azimuth
-
-
-def rms_deg(frames: list[AcousticFrame], azimuth: Callable) -> float:
-    errors = [
-        frame.bearing_rad - azimuth(frame.sample_index / 48_000 - frame.bearing_age_s) for frame in frames
-    ]
-    return float(np.degrees(np.sqrt(np.mean(np.square(errors)))))
-
-
-def test_bearing_of_a_pass_by_with_twenty_of_fifty_six_dead() -> None:
-    sound, azimuth = moving_source(ROOF, 2.2, seed=1)
-    whole = rms_deg(FrontEnd(ROOF, 48_000).process(sound), azimuth)
-    for seed in range(3):
-        dead = np.sort(np.random.default_rng(seed).choice(56, 20, replace=False))
-        spoilt = sound.copy()
-        spoilt[:, dead] = 0.0
-        frames = FrontEnd(ROOF, 48_000).process(spoilt)
-        rms = rms_deg(frames, azimuth)
-        print(f"bearing rms {whole:.3f} deg, with 20 of 56 dead {rms:.3f} deg")
-        assert rms < whole + 0.5
-        assert all(named(frame.health) == {"dead": dead.tolist()} for frame in frames)  # type: ignore[arg-type]
-
-
 def test_leaving_out_noise_keeps_the_bearing() -> None:
-    sound, azimuth = moving_source(ROOF, 3.0, seed=2)
-    rng = np.random.default_rng(2)
+    sound, rng = noise_from(ROOF, 0.5, RATE, 3.0, seed=2), np.random.default_rng(2)
     noisy = rng.choice(56, 20, replace=False)
     sound[:, noisy] = 2 * sound.std() * rng.standard_normal((len(sound), 20))
     watched, unwatched = (
-        FrontEnd(ROOF, 48_000, FrontEndSettings(watch_channels=on)).process(sound) for on in (True, False)
+        FrontEnd(ROOF, RATE, FrontEndSettings(watch_channels=on)).process(sound)[11:] for on in (True, False)
     )
-    assert all(set(named(frame.health)["noisy"]) == set(noisy) for frame in watched[11:])  # type: ignore[union-attr]
-    assert rms_deg(watched[11:], azimuth) < 0.5
-    assert np.mean([f.prominence for f in watched[11:]]) > np.mean([f.prominence for f in unwatched[11:]])
+    assert all(set(named(frame.health)["noisy"]) == set(noisy) for frame in watched)
+    assert max(abs(frame.bearing_rad - 0.5) for frame in watched) < np.radians(0.5)
+    assert np.mean([f.prominence for f in watched]) > np.mean([f.prominence for f in unwatched])
 
 
 @pytest.mark.long
@@ -284,14 +199,14 @@ def test_a_mask_equals_the_array_without_those_channels(dead: set[int], seed: in
 
 
 def test_clipped_microphones_stay_in_use() -> None:
-    sound, azimuth = moving_source(ROOF, 1.6, seed=3)
-    clean = rms_deg(FrontEnd(ROOF, 48_000).process(sound), azimuth)
-    clipped = np.random.default_rng(3).choice(56, 20, replace=False)
+    clean = noise_from(ROOF, 0.5, RATE, 1.6, seed=3)
+    clipped, sound = np.random.default_rng(3).choice(56, 20, replace=False), clean.copy()
     sound[:, clipped] = sound[:, clipped].clip(-0.5 * sound.std(), 0.5 * sound.std())
-    frames = FrontEnd(ROOF, 48_000).process(sound)
-    assert set(named(frames[-1].health)["clipped"]) == set(clipped)  # type: ignore[union-attr]
-    assert frames[-1].health.mask.is_whole  # type: ignore[union-attr]
-    assert rms_deg(frames, azimuth) < clean + 0.1
+    ours, theirs = (FrontEnd(ROOF, RATE).process(one) for one in (sound, clean))
+    assert set(named(ours[-1].health)["clipped"]) == set(clipped)
+    assert ours[-1].health.mask.is_whole
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.bearing_rad == pytest.approx(other.bearing_rad, abs=np.radians(0.1))
 
 
 def test_a_dying_channel_causes_no_step_in_looming_and_levels() -> None:
@@ -300,68 +215,10 @@ def test_a_dying_channel_causes_no_step_in_looming_and_levels() -> None:
     sound = street(array, 11, seconds=2.0, waves=1) / (30.0 - 10.0 * time)[:, None].astype(np.float32)
     broken = sound.copy()
     broken[round(1.55 * RATE) :, 1:4] = 0.0
-    for well, ill in zip(
-        FrontEnd(array, RATE).process(sound), FrontEnd(array, RATE).process(broken), strict=True
-    ):
-        assert isinstance(well.looming, Looming)
-        assert isinstance(ill.looming, Looming)
+    frames = (FrontEnd(array, RATE).process(one) for one in (sound, broken))
+    for well, ill in zip(*frames, strict=True):
         assert abs(well.looming.inverse_tta_hz - ill.looming.inverse_tta_hz) < 2 * well.looming.std_hz
         np.testing.assert_allclose(well.band_log_energy, ill.band_log_energy, atol=0.8)
-
-
-@settings(deadline=None, max_examples=3)
-@given(cuts=st.lists(st.integers(0, 40_000), max_size=8))
-def test_reports_do_not_depend_on_the_block_size(cuts: list[int]) -> None:
-    sound = street(HALF, 12, seconds=2.5)
-    silence(sound, np.random.default_rng(0))
-    inversion(sound, np.random.default_rng(0))
-    sound[30_000:30_200] = 0.0
-    whole = healths(HALF, sound)
-    front_end = FrontEnd(HALF, RATE)
-    pieces = [f.health for b in np.split(sound, sorted(cuts)) for f in front_end.process(b)]
-    for one, other in zip(whole, pieces, strict=True):
-        assert isinstance(other, ArrayHealth)
-        assert (one.faults, one.dropouts, one.coherence) == (other.faults, other.dropouts, other.coherence)
-    assert whole[-1].n_dropouts == 1
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_while_masks_change() -> None:
-    array = MicrophoneArray(ROOF.positions_m[::8])
-    sound = street(array, 13, seconds=1.0)
-    front_end = FrontEnd(array, RATE)
-
-    def run(rounds: int) -> int:
-        for k in range(rounds):
-            spoilt = sound.copy()
-            spoilt[:, [k % 7, (3 * k) % 7]] = 0.0
-            spoilt[k * 37 % RATE :][:64] = 0.0
-            front_end.process(spoilt)
-        gc.collect()
-        return tracemalloc.get_traced_memory()[0]
-
-    tracemalloc.start()
-    before, after = run(10), run(16)
-    tracemalloc.stop()
-    # 160 hops: a steering matrix of one mask alone is 600 kB.
-    assert after - before < 60_000
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_over_an_hour() -> None:
-    rate, array = 8000, MicrophoneArray(ROOF.positions_m[::14])
-    front_end = FrontEnd(array, rate)
-    rng = np.random.default_rng(0)
-    sound = rng.standard_normal((60 * rate, 1)) + 0.1 * rng.standard_normal((60 * rate, 4))
-    tracemalloc.start()
-    traced = []
-    for minute in range(60):
-        sound[minute * 1000 :][:200] = 0.0
-        front_end.process(np.roll(sound, 13 * minute, axis=0))
-        gc.collect()
-        traced.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
-    assert max(traced[30:]) - traced[5] < 100_000
 
 
 def test_dropouts_are_found_at_their_samples() -> None:

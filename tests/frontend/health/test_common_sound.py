@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plane_waves import SPECTRA, array_check, plane_wave, shaped
 
 from worldstate.adapters.acoustic import AcousticAdapter, heard_of
-from worldstate.adapters.files.array_file import named_arrays, write_array_xml
-from worldstate.cli.main import main
+from worldstate.adapters.files.array_file import named_arrays
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.health.common_sound import (
     ARRAY_FAULTS,
@@ -45,25 +44,14 @@ ARRAYS = {
     "two, 0.1 m": np.array([[0.0, 0.05, 0.0], [0.0, -0.05, 0.0]]),
     **{name: np.array(board["positions_m"]) for name, board in named_arrays().items()},
 }
-# Exponents of the amplitude over frequency, below which it is flat.
-SPECTRA = {"white": 0.0, "pink": -0.5, "wind": -1.5}
-
-
-def shaped(white: np.ndarray, spectrum: str) -> np.ndarray:
-    """Give white sound (n, M) a spectrum, at a mean square of 1."""
-    frequencies = np.maximum(np.fft.rfftfreq(len(white), 1.0 / RATE), 20.0)
-    coloured = np.fft.rfft(white, axis=0) * frequencies[:, None] ** SPECTRA[spectrum]
-    sound = np.fft.irfft(coloured, len(white), axis=0)
-    return np.asarray(sound / sound.std())
 
 
 def street(array: MicrophoneArray, spectrum: str, noise_db: float, seed: int = 0) -> np.ndarray:
     """A wave from the left, and noise of its spectrum that is independent between the microphones."""
-    rng, n = np.random.default_rng(seed), 2 * RATE
-    wave = np.fft.rfft(rng.standard_normal(n))[:, None]
-    wave = wave * array.steering(np.fft.rfftfreq(n, 1.0 / RATE), 0.7)[:, :, 0]
-    noise = shaped(rng.standard_normal((n, array.n_microphones)), spectrum)
-    sound = shaped(np.fft.irfft(wave, n, axis=0), spectrum) + 10.0 ** (noise_db / 20.0) * noise
+    rng = np.random.default_rng(seed)
+    wave = plane_wave(array, rng.standard_normal(2 * RATE), 0.7, RATE)
+    noise = shaped(rng.standard_normal((2 * RATE, array.n_microphones)), spectrum, RATE)
+    sound = shaped(wave, spectrum, RATE) + 10.0 ** (noise_db / 20.0) * noise
     return np.asarray(0.01 * sound, np.float32)
 
 
@@ -85,13 +73,6 @@ def test_independent_noise_is_unusable(name: str, spectrum: str) -> None:
 def test_a_wide_pair_makes_no_decision_about_common_sound() -> None:
     pair = MicrophoneArray([[0.0, 0.34, 0.0], [0.0, -0.34, 0.0]])
     assert all(frame.unheard is None for frame in frames_of(pair, street(pair, "white", 30.0)))
-
-
-def test_samples_of_another_format_are_unusable() -> None:
-    """Bytes of another format are uniformly distributed."""
-    array = MicrophoneArray(ROOF[:4])
-    dealt = np.random.default_rng(0).integers(-(2**15), 2**15, (2 * RATE, 4), np.int16)
-    assert max(frame.heard or 0.0 for frame in frames_of(array, dealt)) == 0.0
 
 
 def test_noise_makes_the_sensor_impaired_and_the_recording_unhealthy() -> None:
@@ -130,9 +111,8 @@ def far_field(positions_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Coherence (K, M, M) of some waves from anywhere, over noise of a quarter of their power."""
     directions = rng.standard_normal((3, rng.integers(1, 6)))
     delays = positions_m @ (directions / np.linalg.norm(directions, axis=0)) / 343.0
-    waves = np.exp(-2j * np.pi * BINS_HZ[:, None, None] * delays) * np.sqrt(
-        rng.dirichlet(np.ones(delays.shape[1]))
-    )
+    levels = np.sqrt(rng.dirichlet(np.ones(delays.shape[1])))
+    waves = levels * np.exp(-2j * np.pi * BINS_HZ[:, None, None] * delays)
     return 0.8 * waves @ waves.conj().swapaxes(1, 2)
 
 
@@ -186,9 +166,7 @@ CROSSED = {
     "random order": lambda x, rng: x[:, rng.permutation(x.shape[1])],
     "even ones first": lambda x, rng: np.concatenate([x[:, ::2], x[:, 1::2]], axis=1),
     "half of them 30 ms late": lambda x, rng: np.concatenate([x[180:, ::2], x[:-180, 1::2]], axis=1),
-    "each later, up to 1 s": lambda x, rng: np.stack(
-        [np.roll(c, rng.integers(60, 6000)) for c in x.T], axis=1
-    ),
+    "each later, up to 1 s": lambda x, rng: np.array([np.roll(c, rng.integers(60, 6000)) for c in x.T]).T,
     "every other inverted": lambda x, rng: x * np.where(np.arange(x.shape[1]) % 2, -1.0, 1.0),
     "16 bits read as 32": lambda x, rng: _bits(x, "<i2").view("<i4").reshape(-1, x.shape[1]),
     "a sample of one channel lost": lambda x, rng: x.reshape(-1)[1 : 1 - x.shape[1]].reshape(-1, x.shape[1]),
@@ -209,9 +187,7 @@ def _bits(sound: np.ndarray, kind: str) -> np.ndarray:
 def streets(request: pytest.FixtureRequest) -> dict[str, np.ndarray]:
     """Return some seconds of busy streets of each renderer at each array."""
     chosen = StreamSettings(site(request.param), 0.11, 5, traffic_named("pairs"), sample_rate_hz=6000.0)
-    shifted = [
-        places - places.mean(axis=0) + [0.013 * i, 0.0, 0.0] for i, places in enumerate(SPREAD.values())
-    ]
+    shifted = [one - one.mean(axis=0) + [0.013 * i, 0.0, 0.0] for i, one in enumerate(SPREAD.values())]
     stream = draw_stream(chosen, MicrophoneArray(np.concatenate(shifted)))
     with closing(stream.blocks()) as blocks:
         sound = np.concatenate([stream.recorded(block) for block in blocks])
@@ -239,16 +215,12 @@ def test_a_rotated_ring_is_still_usable() -> None:
 
 
 @pytest.mark.parametrize("kind", ["random order", "each later, up to 1 s", "every other inverted"])
-def test_array_check_exits_with_1_and_the_reason(
-    kind: str, streets: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_array_check_exits_with_1_and_the_reason(kind, streets, tmp_path, capsys):
     array, sound = MicrophoneArray(SPREAD["uma-8"]), np.ascontiguousarray(streets["uma-8"])
-    write_array_xml(tmp_path / "mics.xml", array)
-    soundfile.write(tmp_path / "some.wav", CROSSED[kind](sound, np.random.default_rng(1)), 6000, "FLOAT")
-    check = ["array", "check", str(tmp_path / "some.wav"), "--array", str(tmp_path / "mics.xml")]
-    assert main([*check, "--json"]) == 1
+    wrong = CROSSED[kind](sound, np.random.default_rng(1))
+    assert array_check(tmp_path, array, wrong, 6000, "--json") == 1
     assert json.loads(capsys.readouterr().out)["unheard"] in ARRAY_FAULTS
-    assert main(check) == 1
+    assert array_check(tmp_path, array, wrong, 6000) == 1
     assert capsys.readouterr().out.splitlines()[-1].startswith("not healthy: ")
 
 

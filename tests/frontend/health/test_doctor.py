@@ -1,19 +1,18 @@
 """`worldstate array check` lists all faults; `run` raises an error for silent channels or leaves them out."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
+from plane_waves import array_check
 
 from worldstate.adapters.audio.sound_file import SilentChannelsError, open_audio
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.frontend.health.channel_health import Fault
-from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.channel_report import (
     ChannelVerdict,
     RecordingHealth,
@@ -32,48 +31,28 @@ def street() -> np.ndarray:
     return simulate_recording(draw_settings("SA1", "left", rng, duration_s=2.5), rng, ROOF).audio
 
 
-@pytest.fixture
-def write(tmp_path: Path) -> Callable[[np.ndarray], Path]:
-    def to_file(samples: np.ndarray) -> Path:
-        soundfile.write(tmp_path / "some.wav", samples, RATE, subtype="PCM_24")
-        write_array_xml(tmp_path / "mics.xml", ROOF)
-        return tmp_path / "some.wav"
-
-    return to_file
-
-
-def doctor(path: Path, *options: str) -> int:
-    return main(["array", "check", str(path), "--array", str(path.with_name("mics.xml")), *options])
-
-
 @pytest.mark.long
-def test_a_healthy_recording(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor(write(street)) == 0
+def test_a_healthy_recording(street, tmp_path, capsys):
+    assert array_check(tmp_path, ROOF, street, RATE) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "healthy"
     assert not any(line.startswith("channel") for line in lines)
     assert "hears front as back" in lines[1]
 
 
-def test_array_check_lists_exactly_the_dead_channels(
-    street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_array_check_lists_exactly_the_dead_channels(street, tmp_path, capsys):
     dead = np.sort(np.random.default_rng(0).choice(56, 20, replace=False))
     spoilt = street.copy()
     spoilt[:, dead] = 0.0
-    assert doctor(write(spoilt), "--json", "--figure", str(tmp_path / "array.png")) == 1
+    assert array_check(tmp_path, ROOF, spoilt, RATE, "--json", "--figure", str(tmp_path / "array.png")) == 1
     report = json.loads(capsys.readouterr().out)
     assert not report["healthy"]
-    assert [(fault["channel"], fault["fault"]) for fault in report["faults"]] == [
-        (d + 1, "dead") for d in dead
-    ]
+    assert [(one["channel"], one["fault"]) for one in report["faults"]] == [(d + 1, "dead") for d in dead]
     assert report["masked_microphones"] == (dead + 1).tolist()
     assert (tmp_path / "array.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_array_check_prints_a_remedy_per_fault(
-    street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_array_check_prints_a_remedy_per_fault(street, tmp_path, capsys):
     spoilt = street.copy()
     spoilt[:, [3, 40]] = street[:, [40, 3]]
     spoilt[:, 12] *= -1
@@ -81,7 +60,7 @@ def test_array_check_prints_a_remedy_per_fault(
     spoilt[:, 30] += 3 * street.std()
     spoilt[:, 50] = street.std() * np.random.default_rng(5).standard_normal(len(street))
     spoilt = np.delete(spoilt, np.arange(50_000, 52_000), axis=0)
-    assert doctor(write(spoilt)) == 1
+    assert array_check(tmp_path, ROOF, spoilt, RATE) == 1
     lines = capsys.readouterr().out.splitlines()
     table = {int(line.split()[0]): line for line in lines if line.strip()[:1].isdigit() and "%" in line}
     assert sorted(table) == [4, 13, 21, 31, 41, 51]
@@ -99,42 +78,34 @@ def test_a_microphone_with_any_fault_is_drawn(fault: Fault, tmp_path: Path) -> N
     assert f"<!-- {fault.value} -->" in (tmp_path / "array.svg").read_text()
 
 
-def test_a_wrong_sample_rate(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write(street)
+def test_a_wrong_sample_rate(street, tmp_path, capsys):
     length = len(street) / RATE
-    assert doctor(path, "--duration", str(1.05 * length)) == 1
+    assert array_check(tmp_path, ROOF, street, RATE, "--duration", str(1.05 * length)) == 1
     assert "the header is wrong" in capsys.readouterr().out
-    assert doctor(path, "--duration", str(length + 0.005)) == 0
+    assert array_check(tmp_path, ROOF, street, RATE, "--duration", str(length + 0.005)) == 0
     assert "sample rate by the other clock" in capsys.readouterr().out
 
 
-def test_bad_input(street: np.ndarray, write: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input(street, tmp_path, capsys):
     assert main(["array", "check", "nothing.wav"]) == 2
     assert "nothing.wav: no such file" in capsys.readouterr().err
-    path = write(street[:, :55])
-    assert doctor(path) == 2
+    assert array_check(tmp_path, ROOF, street[:, :55], RATE) == 2
     assert "expected 56 channels" in capsys.readouterr().err
     mostly = street.copy()
     mostly[:, :29] = 0.0
-    assert doctor(write(mostly)) == 2
+    assert array_check(tmp_path, ROOF, mostly, RATE) == 2
     assert "at least half of 56 channels" in capsys.readouterr().err
 
 
-def test_run_leaves_silent_channels_out_with_a_warning(
-    street: np.ndarray,
-    write: Callable,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    spoilt = street.copy()
-    spoilt[:, [6, 9]] = 0.0
-    path = write(spoilt)
-    roof = ["--array", str(path.with_name("mics.xml")), "--uncalibrated"]
-    assert main(["run", str(path), *roof, "--json"]) == 0
-    assert "channel 7, 10 is silent" in caplog.text
-    assert json.loads(capsys.readouterr().out)["masked_microphones"] == [7, 10]
-    assert main(["run", str(write(street)), *roof, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["masked_microphones"] == []
+@pytest.mark.parametrize("silent", [[], [6, 9]])
+def test_run_leaves_silent_channels_out_with_a_warning(street, silent, tmp_path, capsys, caplog):
+    spoilt, path = street.copy(), tmp_path / "some.wav"
+    spoilt[:, silent] = 0.0
+    soundfile.write(path, spoilt, RATE, subtype="PCM_24")
+    write_array_xml(tmp_path / "mics.xml", ROOF)
+    assert main(["run", str(path), "--array", str(tmp_path / "mics.xml"), "--uncalibrated", "--json"]) == 0
+    assert ("channel 7, 10 is silent" in caplog.text) == bool(silent)
+    assert json.loads(capsys.readouterr().out)["masked_microphones"] == [one + 1 for one in silent]
 
 
 def test_open_audio_lists_silent_channels(tmp_path: Path) -> None:
@@ -147,10 +118,6 @@ def test_open_audio_lists_silent_channels(tmp_path: Path) -> None:
     with open_audio(tmp_path / "a.wav", strict=False) as source:
         assert source.silent_channels == (1, 3)
         assert len(np.concatenate(list(source.blocks(1000)))) == 9000
-    samples[:, 1] = 0.1
-    soundfile.write(tmp_path / "b.wav", samples, 8000)
-    with pytest.raises(InputFileError, match=r"b\.wav: expected sound on at least half of 4 channels"):
-        open_audio(tmp_path / "b.wav", strict=False)
 
 
 def test_a_known_duration_checks_the_sample_rate() -> None:

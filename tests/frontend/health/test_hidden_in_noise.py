@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plane_waves import SPECTRA, shaped
 
 from worldstate.adapters.files.array_file import named_arrays
 from worldstate.adapters.listener import Listener, Step
@@ -14,7 +15,6 @@ from worldstate.simulation import SITES, draw_settings, simulate_recording, site
 
 RATE = 6000.0
 UNHEARD, AS_WITHOUT = "unheard", "as without the noise"
-SPECTRA = {"white": 0.0, "pink": -0.5, "wind": -1.5}
 
 
 def drawn_array(rng: np.random.Generator) -> MicrophoneArray:
@@ -62,10 +62,8 @@ def verdict(seed: int) -> tuple[str, str]:
     )
     end = round(with_it.t0_frame / 10 * RATE)
     level = (with_it.audio - without.audio)[end - round(3 * RATE) : end].std() * 10.0 ** (noise_db / 20.0)
-    frequencies = np.maximum(np.fft.rfftfreq(end, 1.0 / RATE), 20.0)[:, None]
-    white = np.fft.rfft(rng.standard_normal((end, array.n_microphones)), axis=0)
-    noise = np.fft.irfft(white * frequencies ** SPECTRA[spectrum], end, axis=0)
-    noisy = steps(array, with_it.audio[:end] + level * noise / noise.std())
+    noise = shaped(rng.standard_normal((end, array.n_microphones)), spectrum, RATE)
+    noisy = steps(array, with_it.audio[:end] + level * noise)
     if all(one.measurement.heard.share < LEAST_HEARD for one in noisy):
         return spectrum, UNHEARD if min(map(risk, noisy)) >= risk(noisy[0]) - 1e-3 else "the risk falls"
     if announced(noisy) == announced(steps(array, with_it.audio[:end])):

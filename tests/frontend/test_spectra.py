@@ -1,0 +1,143 @@
+"""Short-time spectra and other sample rates of a stream: against scipy, in blocks of any length."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from worldstate.frontend.spectra.resampling import Decimator, Resampler
+from worldstate.frontend.spectra.stft import StreamingStft
+from worldstate.ground.typing import Float32Array
+
+
+def whole_file_spectra(samples: np.ndarray, nfft: int, bins: range) -> np.ndarray:
+    """scipy's frames (frames, bins, M), on the scale of a plain windowed sum."""
+    spectra = scipy.signal.stft(samples, nperseg=nfft, axis=0, boundary=None, padded=False)[2]
+    return spectra[bins.start : bins.stop].transpose(2, 0, 1) * nfft / 2
+
+
+@settings(deadline=None)
+@given(
+    lengths=st.lists(st.integers(0, 150), min_size=1, max_size=30),
+    half=st.sampled_from([4, 16, 32]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_blocks_of_any_length_give_scipys_frames(lengths: list[int], half: int, seed: int) -> None:
+    nfft, bins = 2 * half, range(0, half + 1)
+    samples = np.random.default_rng(seed).standard_normal((sum(lengths), 3)).astype(np.float32)
+    stft = StreamingStft(3, nfft, bins)
+    blocks = np.split(samples, np.cumsum(lengths)[:-1])
+    frames = np.concatenate([stft.push(block) for block in blocks])
+    if len(samples) < nfft:
+        assert len(frames) == 0
+    else:
+        np.testing.assert_allclose(frames, whole_file_spectra(samples, nfft, bins), atol=2e-5 * nfft**0.5)
+
+
+def test_the_bins_in_use_agree_to_single_precision() -> None:
+    samples = np.random.default_rng(1).standard_normal((9600, 8)).astype(np.float32)
+    frames = StreamingStft(8, 512, range(1, 19)).push(samples)
+    expected = whole_file_spectra(samples, 512, range(1, 19))
+    assert frames.dtype == np.complex64
+    assert np.abs(frames - expected).max() < 1e-6 * np.abs(expected).max()
+
+
+def test_a_large_offset_does_not_leak_beyond_the_window() -> None:
+    samples = np.full((2048, 1), 1000.0, np.float32)
+    frames = StreamingStft(1, 512, range(2, 19)).push(samples)
+    assert np.abs(frames).max() < 1e-6 * 1000 * 512
+
+
+# Sample rates of converters and of some sound cards.
+RATES = ((8_000, 12_000), (11_025, 12_000), (16_000, 24_000), (22_050, 24_000), (32_000, 48_000))
+RATES += ((44_100, 48_000), (44_056, 48_000), (88_200, 48_000), (96_000, 48_000), (192_000, 48_000))
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def whole(resampler: Resampler, sound: Float32Array) -> Float32Array:
+    """Return the sound at the other rate, up to its end."""
+    return np.concatenate([resampler.push(sound), resampler.flush()])
+
+
+@pytest.mark.parametrize(("rate", "wanted"), RATES)
+def test_resampling_equals_scipy_on_the_whole_sound(rate: int, wanted: int) -> None:
+    highest = 0.45 * min(rate, wanted)
+    low_pass = scipy.signal.firwin(801, 0.9 * highest, fs=rate, window=("kaiser", 9.0))
+    noise = np.random.default_rng(rate).standard_normal((rate, 2))
+    sound = scipy.signal.lfilter(low_pass, 1.0, noise, axis=0).astype(np.float32)
+    resampler = Resampler(2, rate, wanted)
+    found = whole(resampler, sound)
+    ratio = resampler.rate_hz / rate
+    up = next(n for n in range(1, 161) if abs(n / ratio - round(n / ratio)) < 1e-9)
+    down = round(up / ratio)
+    assert abs(resampler.rate_hz / wanted - 1.0) < 1e-3
+    # A filter much longer than that of the resampler.
+    sharp = scipy.signal.firwin(200 * max(up, down) + 1, 1.0 / max(up, down), window=("kaiser", 12.0))
+    expected = scipy.signal.resample_poly(sound.astype(np.float64), up, down, window=sharp)
+    # The cut at the end is not band-limited.
+    inner = slice(0, len(expected) - round(0.05 * wanted))
+    assert len(found) == len(expected)
+    error = found[inner] - expected[inner]
+    assert 20.0 * np.log10(error.std() / expected[inner].std()) < -85.0
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.sampled_from(RATES), st.lists(st.integers(1, 3_000), max_size=20), st.integers(1, 9), SEEDS)
+def test_resampling_in_blocks_is_identical_bit_for_bit(rates, cuts, channels, seed):
+    sound = np.random.default_rng(seed).standard_normal((3_000, channels), dtype=np.float32)
+    at_once, in_blocks = Resampler(channels, *rates), Resampler(channels, *rates)
+    edges = [0, *sorted(set(cuts)), len(sound)]
+    parts = [in_blocks.push(sound[start:end]) for start, end in pairwise(edges)]
+    np.testing.assert_array_equal(np.concatenate(parts), at_once.push(sound))
+
+
+@pytest.mark.parametrize(("rate", "wanted"), RATES)
+def test_a_click_stays_at_its_time(rate: int, wanted: int) -> None:
+    sound = np.zeros((rate // 2, 1), np.float32)
+    sound[rate // 4] = 1.0
+    resampler = Resampler(1, rate, wanted)
+    power = whole(resampler, sound)[:, 0].astype(np.float64) ** 2
+    centre_s = (power @ np.arange(len(power))) / power.sum() / resampler.rate_hz
+    assert centre_s == pytest.approx((rate // 4) / rate, abs=2e-6)
+
+
+@pytest.mark.parametrize(("rate", "wanted"), RATES)
+def test_silence_stays_silence_and_is_as_long(rate: int, wanted: int) -> None:
+    resampler = Resampler(3, rate, wanted)
+    for seconds in range(1, 4):
+        resampler.push(np.zeros((rate, 3), np.float32))
+        assert len(resampler._waiting) < 0.03 * rate, seconds
+    fresh = Resampler(3, rate, wanted)
+    assert not (found := whole(fresh, np.zeros((rate, 3), np.float32))).any()
+    assert len(found) == math.ceil(fresh.rate_hz)
+
+
+def tone(frequency_hz: float, n: int, rate: float) -> np.ndarray:
+    return np.cos(2 * np.pi * frequency_hz / rate * np.arange(n) + 0.3)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    cuts=st.lists(st.integers(0, 6000), max_size=8),
+    rate=st.sampled_from([1_000, 2_500.0, 8_000, 47_998]),
+    share=st.floats(0.0, 1.0),
+)
+def test_decimation_keeps_the_band_where_it_was(cuts: list[int], rate: float, share: float) -> None:
+    """A tone in the band comes out as itself, sampled at the promised instants, whatever the blocks."""
+    decimator, frequency = Decimator(rate, 300.0), 300.0 * share
+    sound = tone(frequency, 6000, rate)
+    heard = np.concatenate([decimator.push(block) for block in np.split(sound, sorted(cuts))])
+    assert len(heard) == (6000 - decimator.n_taps) // decimator.factor + 1
+    instants = (np.arange(len(heard)) * decimator.factor + 0.5 * (decimator.n_taps - 1)) / rate
+    np.testing.assert_allclose(heard, np.cos(2 * np.pi * frequency * instants + 0.3), atol=3e-4)
+
+
+@pytest.mark.parametrize("frequency_hz", [835.0, 1230.0, 1500.0, 5000.0, 23_000.0])
+def test_decimation_leaves_no_aliases_in_the_band(frequency_hz: float) -> None:
+    decimator = Decimator(47_998, 400.0)
+    assert decimator.rate_hz - 400.0 < 835.0
+    assert np.abs(decimator.push(tone(frequency_hz, 24_000, 47_998))).max() < 2e-4
