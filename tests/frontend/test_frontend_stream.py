@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plane_waves import noise_from
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
+from worldstate.frontend.array import steering
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.array.steering import Steering
+from worldstate.frontend.array.steering import Steering, one_blas_thread
 from worldstate.frontend.direction.bearing import direct_probability, srp_phat
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.hop_spectra import BANDS, LevelMeter, NoiseMeter
@@ -342,3 +345,30 @@ def test_an_all_round_search_treats_all_directions_alike(azimuth_deg: float) -> 
     assert other.bearing_std_rad == pytest.approx(one.bearing_std_rad, rel=0.02)
     assert direct_probability(other.peaks) == pytest.approx(direct_probability(one.peaks), abs=0.02)
     assert [round(p.value, 2) for p in other.peaks] == [round(p.value, 2) for p in one.peaks]
+
+
+def blas_threads() -> set[int]:
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_the_limit_is_lifted_at_the_end_of_the_outer_one_and_after_an_error() -> None:
+    steering._controller.cache_clear()  # An earlier test may have loaded another library
+    with threadpool_limits(2, user_api="blas"):
+        with suppress(KeyError), one_blas_thread():
+            with one_blas_thread():
+                assert blas_threads() == {1}
+            assert blas_threads() == {1}
+            raise KeyError
+        assert blas_threads() == {2}
+
+
+def test_the_number_of_threads_does_not_change_a_bit() -> None:
+    array = MicrophoneArray(np.random.default_rng(0).uniform(-0.3, 0.3, (24, 3)))
+    sound = np.random.default_rng(1).standard_normal((16_000, 24))
+    steering._controller.cache_clear()
+    frames = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, user_api="blas"):
+            frames.append(FrontEnd(array, 16_000).process(sound)[0])
+    np.testing.assert_array_equal(frames[0].srp, frames[1].srp)
+    np.testing.assert_array_equal(frames[0].feature, frames[1].feature)
