@@ -42,9 +42,8 @@ def test_all_names_together_can_be_learned():
 
 @pytest.mark.parametrize("name", worldstate._FORMER)
 def test_a_name_that_has_moved_warns_and_names_its_package(name):
-    with pytest.warns(
-        DeprecationWarning, match=rf"^worldstate\.{name} is worldstate\.\w+\.{name}$"
-    ) as caught:
+    told = rf"^worldstate\.{name} is worldstate\.\w+\.{name}$"
+    with pytest.warns(DeprecationWarning, match=told) as caught:
         value = getattr(worldstate, name)
     assert caught[0].filename == __file__
     package = str(caught[0].message).split(" is ")[1].rpartition(".")[0]
@@ -84,15 +83,11 @@ def test_lines_of_a_page_can_be_read_as_text(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_objects_that_a_page_links_are_exported(page):
-    linked = re.findall(r"\{py:obj\}`([\w.]+)`", page.read_text(encoding="utf-8"))
-    missing = []
-    for target in linked:
+    for target in re.findall(r"\{py:obj\}`([\w.]+)`", page.read_text(encoding="utf-8")):
         name, *member = target.split(".")
-        known = name in HOMES and all(
-            hasattr(getattr(importlib.import_module(HOMES[name]), name), m) for m in member
-        )
-        missing += [] if known else [target]
-    assert missing == []
+        assert name in HOMES, target
+        value = getattr(importlib.import_module(HOMES[name]), name)
+        assert all(hasattr(value, one) for one in member), target
 
 
 PROGRAMS = {one.name: one for one in (PROGRAM, LABORATORY)}
@@ -116,10 +111,8 @@ def test_commands_of_a_page_exist_with_their_options(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_files_that_a_page_names_exist(page):
-    named = re.findall(
-        r"`((?:frontend|abduction|adapters|worldstate|docs|tests)/[\w/.-]+)`",
-        page.read_text(encoding="utf-8"),
-    )
+    files = r"`((?:frontend|abduction|adapters|worldstate|docs|tests)/[\w/.-]+)`"
+    named = re.findall(files, page.read_text(encoding="utf-8"))
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 

@@ -18,6 +18,12 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 SIBLINGS = ["abduction", "adapters", "frontend", "simulation"]
 
 
+def printed_by(*words: str) -> str:
+    """Return the output of Python with these arguments."""
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True)
+    return done.stdout
+
+
 def packages_in_tree() -> set[str]:
     homes = {"worldstate": ROOT / "worldstate"} | {f"worldstate.{name}": ROOT / name for name in SIBLINGS}
     found = set()
@@ -53,10 +59,8 @@ def test_the_laboratory_is_of_the_same_version():
 
 
 def modules_of_the_product() -> str:
-    folders = ("abduction", "adapters", "frontend", "simulation", "worldstate")
-    return "\n".join(
-        path.read_text(encoding="utf-8") for name in folders for path in (ROOT / name).rglob("*.py")
-    )
+    paths = (path for name in (*SIBLINGS, "worldstate") for path in (ROOT / name).rglob("*.py"))
+    return "\n".join(path.read_text(encoding="utf-8") for path in paths)
 
 
 @pytest.mark.parametrize(
@@ -82,8 +86,7 @@ def test_a_missing_package_is_named_with_its_extra_before_any_work(package):
         f"import pathlib, sys; sys.modules['{package}'] = None; import worldstate, worldstate.operations\n"
         f"try: {call}\nexcept worldstate.ground.MissingExtraError as error: print(error)"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert f"pip install 'worldstate[{extra}]'" in done.stdout
+    assert f"pip install 'worldstate[{extra}]'" in printed_by("-c", script)
 
 
 HEAVY = {"scipy.stats", "scipy.signal", "sklearn", "filterpy", "gtsam", "matplotlib", "cv2", "networkx"}
@@ -103,8 +106,7 @@ HEAVY = {"scipy.stats", "scipy.signal", "sklearn", "filterpy", "gtsam", "matplot
 )
 def test_import_stays_light(statement):
     script = f"import sys; {statement}; print(*sorted({HEAVY!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+    assert printed_by("-c", script).split() == []
 
 
 HEARD = """
@@ -117,18 +119,10 @@ assert len(Listener(ovad_array(), 48_000).push(np.random.default_rng(0).normal(0
 
 @pytest.mark.long
 def test_a_stream_is_heard_without_the_parts_of_scipy_that_are_slow_to_import():
-    slow = {
-        "scipy.stats",
-        "scipy.signal",
-        "scipy.fft",
-        "scipy.ndimage",
-        "scipy.special",
-        "scipy.optimize",
-        "scipy.linalg",
-    }
+    parts = "stats", "signal", "fft", "ndimage", "special", "optimize", "linalg"
+    slow = {f"scipy.{part}" for part in parts}
     script = f"{HEARD}\nimport sys; print(*sorted({slow!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+    assert printed_by("-c", script).split() == []
 
 
 def exporting_packages():
@@ -162,8 +156,7 @@ def test_everything_can_be_imported_at_once():
 
 @pytest.mark.parametrize("command", [["-m", "worldstate"], ["-m", "worldstate.cli.main"]])
 def test_it_runs_as_a_module_and_names_its_version(command):
-    done = subprocess.run([sys.executable, *command, "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["worldstate", worldstate.__version__]
+    assert printed_by(*command, "--version").split() == ["worldstate", worldstate.__version__]
 
 
 # Stands for pip-audit, which takes a list without versions, and passes over unknown ones without --strict.
@@ -179,9 +172,8 @@ def test_an_audit_of_nothing_fails(locked, audited, tmp_path):
     (tmp_path / "locked.txt").write_text(locked)
     (tmp_path / "auditor").write_text(AUDITOR)
     (tmp_path / "auditor").chmod(0o755)
-    done = subprocess.run(
-        ["make", "audit", "PYTHON=./auditor"], cwd=tmp_path, capture_output=True, check=False
-    )
+    audit = ["make", "audit", "PYTHON=./auditor"]
+    done = subprocess.run(audit, cwd=tmp_path, capture_output=True, check=False)
     assert (done.returncode == 0) is audited
     assert (tmp_path / "audited").exists() is audited
 
