@@ -16,8 +16,8 @@ from worldstate.state.context import Priors
 HYPOTHESES = Priors(0.5, 0.2, 0.3)
 
 
-def state(time_s: float, advisory: bool, entity_id: str = "a", *entities: Entity) -> WorldState:
-    told = Advisory(0, 10**9) if advisory else None
+def state(time_s: float, since_s: float | None, entity_id: str = "a", *entities: Entity) -> WorldState:
+    told = None if since_s is None else Advisory(nanoseconds(since_s), nanoseconds(since_s + 1.0))
     cue = RiskCue("left", 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, HYPOTHESES, told, entity_id=entity_id)
     return WorldState(nanoseconds(time_s), 0, entities=entities, relations=(), context=Context(), cues=(cue,))
 
@@ -26,8 +26,8 @@ def summary(t0_s: float | None, onsets: dict[float, str], *entities: Entity, haz
     meter = WarningMeter(t0_s, hazard_free)
     for hop in range(100):
         time_s = hop / 10
-        on = next((i for start, i in onsets.items() if start <= time_s < start + 0.3), None)
-        meter.update(state(time_s, on is not None, on or "-", *entities))
+        since_s = next((start for start in onsets if start <= time_s < start + 0.3), None)
+        meter.update(state(time_s, since_s, onsets.get(since_s, "-"), *entities))
     return meter.summary()
 
 
@@ -89,7 +89,8 @@ LEFT = track("left", 6.0, 8.0)
 )
 def test_the_announcement_states_the_lead_time_of_each_vehicle(onsets_s, truth, told):
     hops = [hop / 10 for hop in range(100)]
-    states = [state(time_s, any(at <= time_s < at + 0.3 for at in onsets_s)) for time_s in hops]
+    since_s = [next((at for at in onsets_s if at <= time_s < at + 0.3), None) for time_s in hops]
+    states = map(state, hops, since_s)
     assert announcement(states, truth, "a van") == told
 
 

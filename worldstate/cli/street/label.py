@@ -107,7 +107,7 @@ def _windows(
     import numpy as np
 
     from worldstate.adapters.audio.sound_file import open_sound
-    from worldstate.operations.labelling.label_files import window_rows
+    from worldstate.operations.labelling.label_files import labelled_windows
 
     with open_sound(source.sound, channels=source.array.channels) as audio:
         time_s = np.arange(10, int(10.0 * audio.duration_s) + 1) / 10.0
@@ -115,4 +115,4 @@ def _windows(
     for one in tracks:
         seen |= (time_s >= one.time_s[0] - 0.05) & (time_s <= one.time_s[-1] + 0.05)
     environment = arguments.environment or f"S{source.audio_path.parent.name}"
-    return window_rows(passes, seen, time_s, environment, file)
+    return labelled_windows(passes, seen, time_s, environment, file)

@@ -51,7 +51,7 @@ class ApproachMeter:
         self.usable += bool(state.cues) and all(cue.usable for cue in state.cues)
         self.budget = None if state.budget is None else state.budget.onsets_per_hour
         raised = [cue for cue in state.cues if cue.advisory is not None]
-        key = sensors_of(state), _unheard(state)
+        key = sensor_words(state), _unheard(state)
         self._hops[key] += 1
         self._onsets[key] += bool(raised) and not self._raised
         self._raised = bool(raised)
@@ -121,13 +121,13 @@ class ApproachMeter:
         ]
 
 
-def sensors_of(state: WorldState) -> str:
+def sensor_words(state: WorldState) -> str:
     """Describe the condition of every sensor in words.
 
     Examples
     --------
     >>> from worldstate.state import SensorHealth
-    >>> sensors_of(WorldState(0, 1, sensors=(SensorHealth("acoustic", "working", 0),)))
+    >>> sensor_words(WorldState(0, 1, sensors=(SensorHealth("acoustic", "working", 0),)))
     'acoustic working'
     """
     return ", ".join(f"{one.sensor} {one.condition}" for one in state.sensors)

@@ -30,7 +30,7 @@ from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, ho
 from .approach_meter import ApproachMeter, alarm_level
 from .cascade import SAMPLED, kept_seconds
 from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
-from .corpus_tables import TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_rows
+from .corpus_tables import TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_table
 
 _IN_SETTINGS = "settings", "budget", "alpha", "uncalibrated"
 # Version of the tables; each major version reads only its own.
@@ -200,7 +200,7 @@ def hear(
     former = defaultdict[str, list[Path]](list)
     for path in plan.out.glob(f"*/*-*{PARQUET}"):
         former[path.name.partition("-")[0]].append(path)
-    work, shards = partial(hear_recording, plan), []
+    work, shards = partial(process_recording, plan), []
     working = in_processes(work, inputs, jobs) if executor is None else in_executor(executor, work, inputs)
     for one, found in zip(inputs, working, strict=True):
         # Remove the tables of an earlier content of the recording, so that its hours are not added.
@@ -212,7 +212,7 @@ def hear(
     return shards
 
 
-def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
+def process_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
     """Process one recording unless its files exist; its row in ``recordings`` is written last."""
     content, row = "", None
     try:
@@ -230,7 +230,7 @@ def hear_recording(plan: HearPlan, one: CorpusInput) -> HeardShard:
         failure = " ".join(text.replace(str(one.path), one.name).split())
         row = HeardRecording(one.name, one.site, content, failure=failure)
     shard = plan.shard(one, content)
-    write_rows(plan.file("recordings", shard), HeardRecording, [row])
+    write_table(plan.file("recordings", shard), HeardRecording, [row])
     status = "failed" if row.failure else "heard"
     return HeardShard(one.name, shard, status, row.hops * HOP_S, row.failure)
 
@@ -242,7 +242,7 @@ def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
         for _, state in read_log(one.path):
             meter.update(state)
     elif plan.card["hops"]:
-        write_rows(plan.file("hops", shard), HeardHop, _hops(_source(plan, one), meter))
+        write_table(plan.file("hops", shard), HeardHop, _hops(_source(plan, one), meter))
     else:
         source = _source(plan, one)
         kept = kept_seconds(source) if plan.card["cascade"] else None
@@ -251,8 +251,8 @@ def _hear(plan: HearPlan, one: CorpusInput, content: str) -> HeardRecording:
             meter.update(step.state)
         if kept is not None:
             meter.cascaded(kept, sampled)
-    write_rows(plan.file("approaches", shard), HeardApproach, meter.approaches)
-    write_rows(plan.file("hours", shard), StateHours, meter.hours())
+    write_table(plan.file("approaches", shard), HeardApproach, meter.approaches)
+    write_table(plan.file("hours", shard), StateHours, meter.hours())
     return meter.recording(content)
 
 

@@ -103,7 +103,7 @@ TABLES: Mapping[str, type] = {
 _ARROW = {str: "string", float: "double", int: "int64", bool: "bool"}
 
 
-def write_rows(path: Path, kind: type, rows: Iterable[Any]) -> None:
+def write_table(path: Path, kind: type, rows: Iterable[Any]) -> None:
     """Write one file of a table, atomically."""
     arrow, parquet = optional("pyarrow"), optional("pyarrow.parquet")
     left, schema = map(asdict, rows), _schema(kind)

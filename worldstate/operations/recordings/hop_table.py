@@ -9,7 +9,7 @@ from zlib import crc32
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
+from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.adapters.files.file_io import load_npz, save_npz
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable, seconds
 from worldstate.ground.checks import check_shape, finite_array
@@ -231,41 +231,32 @@ def hop_stream(
 
 def load_streams(path: str | Path) -> list[HopTable]:
     """Read and validate the hop streams of a file, which may come from a user."""
-
-    def read(arrays: dict[str, AnyArray]) -> list[HopTable]:
-        streams = _tables(arrays).get("", [])
-        for stream in streams:
-            _check_stream(stream)
-        return streams
-
-    streams = load_npz(path, "hop streams", MAX_BYTES, read)
+    streams = load_npz(path, "hop streams", MAX_BYTES, _checked_streams)
     if not streams:
         raise InputFileError(path, "expected at least one hop stream")
     return streams
 
 
-def _check_stream(stream: HopTable) -> None:
-    if not set(STREAM_COLUMNS) <= set(stream.columns):
-        raise InvalidArgumentError(f"expected the columns {', '.join(STREAM_COLUMNS)}")
-    for name in ("time_s", "miss_rate", "clutter_rate"):
-        finite_array(name, stream.columns[name], (None,))
-    finite_array("log_likelihoods", stream.log_likelihoods, (None, None))
-    if not np.isin(stream.answer, (UNQUERIED, ABSENT, PRESENT)).all():
-        raise InvalidArgumentError("answer: expected 0 unqueried, 1 absent or 2 present")
-
-
-def _answer(co_evidence: CoEvidence) -> tuple[int, float, float]:
-    if isinstance(co_evidence, Absent | Present):
-        answer = ABSENT if isinstance(co_evidence, Absent) else PRESENT
-        return answer, co_evidence.miss_rate, co_evidence.clutter_rate
-    return UNQUERIED, 1.0, 0.0
+def _checked_streams(arrays: dict[str, AnyArray]) -> list[HopTable]:
+    streams = _tables(arrays).get("", [])
+    for stream in streams:
+        if not set(STREAM_COLUMNS) <= set(stream.columns):
+            raise InvalidArgumentError(f"expected the columns {', '.join(STREAM_COLUMNS)}")
+        for name in ("time_s", "miss_rate", "clutter_rate"):
+            finite_array(name, stream.columns[name], (None,))
+        finite_array("log_likelihoods", stream.log_likelihoods, (None, None))
+        if not np.isin(stream.answer, (UNQUERIED, ABSENT, PRESENT)).all():
+            raise InvalidArgumentError("answer: expected 0 unqueried, 1 absent or 2 present")
+    return streams
 
 
 def _measured(one: Measurement) -> tuple[Any, ...]:
     """Return the columns of a hop except the last two."""
-    heard, approach = one.signature.log_likelihoods, one.approach
+    look, approach, answer = one.co_evidence, one.approach, (UNQUERIED, 1.0, 0.0)
+    if isinstance(look, Absent | Present):
+        answer = PRESENT if isinstance(look, Present) else ABSENT, look.miss_rate, look.clutter_rate
     rate = np.nan if isinstance(approach, NotUsable) else approach.inverse_tta_hz / approach.std_hz
-    return seconds(one.stamp_ns), heard, *_answer(one.co_evidence), rate
+    return seconds(one.stamp_ns), one.signature.log_likelihoods, *answer, rate
 
 
 def signature_checksum(signature: object) -> int:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,6 +17,7 @@ from worldstate.operations.metrics.approach_table import LONGEST_LEAD_S, onset_o
 from worldstate.state import WorldState
 
 from .channel_report import HealthLog, RecordingHealth
+from .evidence_report import told_advisories
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +253,9 @@ def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehic
     >>> announcement([], [])
     'no vehicle came into sight, and none was announced'
     """
-    onsets = _onsets_by_side(states)
+    onsets = defaultdict[str, list[float]](list)
+    for one in told_advisories(states)[0]:
+        onsets[one.direction].append(seconds(one.since_ns))
     came = sorted((*one.visible_s, _side(one)) for one in truth if one.visible_s and not one.in_view[0])
     if not came:
         told = ", and none was announced" if not onsets else ", although one was announced"
@@ -260,7 +263,7 @@ def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehic
     sentences, before_s = [], dict[str, float]()
     for first_s, last_s, side in came:
         # An earlier announcement belongs to the previous vehicle and ended with its hand-over.
-        own_s = [time_s for time_s in onsets.get(side, ()) if time_s > before_s.get(side, -math.inf)]
+        own_s = [time_s for time_s in onsets[side] if time_s > before_s.get(side, -math.inf)]
         sentences.append(f"{vehicle} from the {side} was {_announced(own_s, first_s, last_s)}")
         before_s[side] = first_s
     return "; ".join(sentences)
@@ -268,16 +271,6 @@ def announcement(states: Iterable[WorldState], truth: Sequence[TrueTrack], vehic
 
 def _side(track: TrueTrack) -> str:
     return "left" if track.azimuth_rad[track.in_view][0] > 0.0 else "right"
-
-
-def _onsets_by_side(states: Iterable[WorldState]) -> dict[str, list[float]]:
-    onsets, standing = dict[str, list[float]](), set[str]()
-    for state in states:
-        raised = {cue.direction for cue in state.cues if cue.advisory and cue.direction}
-        for side in raised - standing:
-            onsets.setdefault(side, []).append(state.time_s)
-        standing = raised
-    return onsets
 
 
 def _announced(onsets_s: Sequence[float], first_s: float, last_s: float) -> str:

@@ -15,7 +15,7 @@ from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import check_extra, optional
 from worldstate.measurement.measurement import Sighting
 
-from .log_page import PageData, Row, degrees, page_html, page_row, sector
+from .log_page import PageData, Row, degrees, ends_deg, page_html, page_row
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -164,7 +164,7 @@ def _live_row(live: LiveStep) -> Row:
     state = live.step.state
     late = {"latency_s": round(live.latency_s, 3), "overruns": live.overruns, "lost_s": round(live.lost_s, 2)}
     sensors = [[one.sensor, one.condition, one.reason] for one in state.sensors]
-    views = {one.sensor: sector(one.sector_rad) for one in state.searched}
+    views = {one.sensor: ends_deg(one.sector_rad) for one in state.searched}
     cameras = {
         seen.look.sensor: views[seen.look.sensor] | {"boxes": [_box(one) for one in seen.sightings]}
         for seen in live.step.measurement.looks

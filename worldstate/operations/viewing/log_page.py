@@ -315,12 +315,12 @@ def page_row(state: WorldState) -> Row:
                 "edge": degrees(one.edge_azimuth_rad),
                 "assumed": one.assumed,
                 "crossing": CROSSING_M if one.crossing_m is None else one.crossing_m,
-                **sector(hidden_sector(one)),
+                **ends_deg(hidden_sector(one)),
             }
             for one in state.context.occluders
         ],
         "searched": [
-            {"sensor": one.sensor, "found": one.found, **sector(one.sector_rad)} for one in state.searched
+            {"sensor": one.sensor, "found": one.found, **ends_deg(one.sector_rad)} for one in state.searched
         ],
         "heard": {one.sensor: round(one.share, 2) for one in state.heard or ()},
         "foreign": isinstance(state.domain, Foreign),
@@ -335,7 +335,7 @@ def _entity(one: Entity) -> Row:
         "label": label_of(one),
         "existence": round(one.existence_probability, 3),
         "azimuth": degrees(one.azimuth_rad),
-        **sector(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
+        **ends_deg(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
         "place": None if one.position_m is None else [round(value, 1) for value in one.position_m[:2]],
     }
 
@@ -352,7 +352,7 @@ def _cue(one: RiskCue) -> Row:
         "said": [text for text in (held, one.not_advised) if text],
         "usable": one.usable,
         "why_not": list(one.why_not),
-        **sector(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
+        **ends_deg(sector_of(one.azimuth_rad, one.azimuth_std_rad, one.sector_rad)),
         "evidence": evidence
         and {
             "hypothesis": evidence.hypothesis,
@@ -369,7 +369,7 @@ def _track(true: TrueTrack) -> list[Row]:
     return [dict(zip(("t", "azimuth", "in_view", "place"), row, strict=True)) for row in rows]
 
 
-def sector(sector_rad: tuple[float, float]) -> Row:
+def ends_deg(sector_rad: tuple[float, float]) -> Row:
     """Return the ends of a sector in degrees."""
     low, high = map(degrees, sector_rad)
     return {"low": low, "high": high}
