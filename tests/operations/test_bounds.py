@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize_scalar
 
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
@@ -77,31 +76,6 @@ def test_endfire_has_no_information_about_the_bearing():
     line = np.column_stack([0 * y, y, 0 * y])
     assert bearing_crb_rad2(line, np.pi / 2, 1000.0, 1.0, 1) > 1e20
     assert bearing_crb_rad2(line, 0.1, 1000.0, 0.0, 1) == np.inf
-
-
-@pytest.mark.parametrize(("azimuth_deg", "snr"), [(0.0, 0.3), (0.0, 3.0), (20.0, 1.0), (65.0, 3.0)])
-def test_beamformer_peak_meets_the_bearing_bound(azimuth_deg, snr):
-    """For one source in white noise the maximum of the beamformer is maximum likelihood."""
-    rng = np.random.default_rng(int(azimuth_deg + 10 * snr))
-    positions, frequency = roof_array_56().positions_m, 1000.0
-    truth, snapshots, trials = np.deg2rad(azimuth_deg), 20, 500
-
-    def steer(azimuth):
-        return np.exp(2j * np.pi * frequency / SOUND_M_S * (positions[:, 1] * np.sin(azimuth)))
-
-    errors = []
-    for _ in range(trials):
-        wave = np.sqrt(snr) * np.exp(2j * np.pi * rng.uniform(size=snapshots))
-        noise = (rng.normal(size=(snapshots, 56)) + 1j * rng.normal(size=(snapshots, 56))) / np.sqrt(2)
-        X = wave[:, None] * steer(truth) + noise
-        peak = minimize_scalar(
-            lambda azimuth, X=X: -np.sum(np.abs(X @ steer(azimuth).conj()) ** 2),
-            bounds=(truth - 0.1, truth + 0.1), method="bounded", options={"xatol": 1e-8},
-        )  # fmt: skip
-        errors.append(peak.x - truth)
-    bound = bearing_crb_rad2(positions, truth, frequency, snr, snapshots)
-    ratio_db = 10 * np.log10(np.mean(np.square(errors)) / bound)
-    assert 10 * np.log10(1 - 3 * np.sqrt(2 / trials)) < ratio_db < 1.5
 
 
 def bearing_trial(array, azimuth_deg, snr_db, trials):

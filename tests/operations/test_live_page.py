@@ -179,10 +179,8 @@ STATED = scripted_states()
 
 @given(st.sampled_from(STATED), st.booleans(), st.lists(st.sampled_from(sorted(WHY_NOT)), unique=True))
 def test_the_sentence_has_every_advisory_and_reason(state, advised, reasons):
-    cues = tuple(
-        replace(one, usable=not reasons, why_not=tuple(reasons), advisory=one.advisory if advised else None)
-        for one in state.cues
-    )
+    given = {"usable": not reasons, "why_not": tuple(reasons)} | ({} if advised else {"advisory": None})
+    cues = tuple(replace(one, **given) for one in state.cues)
     said = headline(replace(state, cues=cues))
     for cue in cues:
         told = f"{cue.direction}: a vehicle is hidden, {100 * cue.within['3']:.0f} % to appear within 3 s"
@@ -236,15 +234,13 @@ def test_a_browser_shows_the_run_without_an_error(states, tmp_path):
         assert seen.value("at('sentence').textContent") == headline(states[-1])
         seen.until(f"rows.length === {len(states) + 4}")
         assert "40 ms behind the sound" in seen.value(shown)
-        boxes = seen.value(
-            "[...document.querySelectorAll('#cameras svg text:not(.muted)')].map(one => one.textContent)"
-        )
+        texts = "[...document.querySelectorAll('#cameras svg text:not(.muted)')]"
+        boxes = seen.value(f"{texts}.map(one => one.textContent)")
         assert boxes == ["car 0.90", "</script><b> 0.50, parked"]
         assert "camera: 2 boxes" in seen.value("at('cameras').textContent")
         # The view to the left is on the left.
-        lefts = seen.value(
-            "[...document.querySelectorAll('#cameras rect')].slice(1).map(one => +one.getAttribute('x'))"
-        )
+        drawn = "[...document.querySelectorAll('#cameras rect')].slice(1)"
+        lefts = seen.value(f"{drawn}.map(one => +one.getAttribute('x'))")
         assert lefts[0] < lefts[1]
         # The selected time stays while hops continue, until the page follows again.
         seen.press("Home")

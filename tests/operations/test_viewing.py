@@ -182,7 +182,7 @@ def test_the_axis_begins_with_the_first_window_on_a_clock_of_1970_too(panels, st
 
 
 def test_an_advisory_stands_in_the_row_of_its_side(panels, states):
-    raised = [one for one in states if any(cue.direction == "left" and cue.advisory for cue in one.cues)]
+    raised = [one for one in states if one.left.advisory]
     rows = panels()[1]
     names = [label.get_text() for label in rows.get_yticklabels()]
     bar = rows.collections[0].get_paths()[0].get_extents()
@@ -192,13 +192,12 @@ def test_an_advisory_stands_in_the_row_of_its_side(panels, states):
 
 def test_log_odds_are_drawn_with_threshold_and_onsets(panels, states):
     budgeted = [replace(state, calibrated=True) for state in states]
-    terms = [next(cue for cue in state.cues if cue.direction == "left").evidence for state in states]
+    terms = [state.left.evidence for state in states]
     lines = {line.get_label(): line for line in panels(budgeted)[2].lines}
     compared = [one.compared_nats for one in terms]
     assert lines["log-odds, left"].get_ydata() == pytest.approx(compared)
     assert lines["threshold"].get_ydata() == pytest.approx([one.threshold_nats for one in terms])
-    raised = [any(cue.advisory and cue.direction == "left" for cue in state.cues) for state in states]
-    first = raised.index(True)
+    first = [bool(state.left.advisory) for state in states].index(True)
     onset = [[states[first].stamp_ns / 1e9, compared[first]]]
     assert lines["onset"].get_xydata().tolist() == pytest.approx(np.array(onset))
 
