@@ -2,11 +2,9 @@
 
 import logging
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,12 +14,12 @@ from worldstate.abduction.sequence.street_sides import PassSound, arrival_patter
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.acoustic_domain import heard_with
-from worldstate.adapters.files.file_io import read_json, refused_as_file, write_json
+from worldstate.adapters.files.file_io import read_record, write_json
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import Source, open_source
 from worldstate.ground import NotUsable, OutOfDomainError, seconds
-from worldstate.ground.serialisation import decode, encode
+from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import FloatArray
 from worldstate.smoothing.learned_street import LearnedStreet, StreetPass, watched, with_pass
 
@@ -132,8 +130,6 @@ def write_street(path: str | Path, street: LearnedStreet) -> None:
 def read_street(path: str | Path) -> LearnedStreet:
     """Read a file written by `write_street`.
 
-    Files of worldstate 0.2 also contain rates of reveal and departure, which are ignored with a warning.
-
     Raises
     ------
     InputFileError
@@ -141,9 +137,4 @@ def read_street(path: str | Path) -> LearnedStreet:
     SchemaVersionError
         If the file has another major version, or is not a street.
     """
-    with refused_as_file(path):
-        told: Any = read_json(path, "a learned street file")
-        street = decode(LearnedStreet, told, "learned street")
-    if any("reveals" in arm for arm in told["arms"]):
-        warnings.warn(f"{path}: its rates of reveal and departure are no longer used", stacklevel=2)
-    return street
+    return read_record(LearnedStreet, path, "learned street")
