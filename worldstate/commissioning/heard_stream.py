@@ -181,15 +181,12 @@ def _streams(
     names: Mapping[int, str], first_seed: int, minutes_of: Mapping[str, float], settings: CommissionSettings
 ) -> list[StreamSettings]:
     """Return a stream of each traffic at every numbered junction, or as many drives as fill its time."""
-    found: list[StreamSettings] = []
+    found, rate = list[StreamSettings](), rate_for(settings.bandwidth_hz)
     for (number, name), (traffic, minutes) in product(names.items(), minutes_of.items()):
         own = first_seed + number + SEEDS_EACH * settings.seed
+        each = DRIVES_S[traffic] / 60.0 if settings.moving_ego else minutes
         whole = StreamSettings(
-            junction_named(name),
-            DRIVES_S[traffic] / 60.0 if settings.moving_ego else minutes,
-            own,
-            traffic_named(traffic),
-            sample_rate_hz=rate_for(settings.bandwidth_hz),
+            junction_named(name), each, own, traffic_named(traffic), sample_rate_hz=rate_hz
         )
         drives = ceil(minutes / whole.minutes - 1e-9) if settings.moving_ego else 0
         found += [replace(whole, seed=own * DRIVES_EACH + i) for i in range(drives)] or [whole]
@@ -296,10 +293,7 @@ def hear_stream(
         samples = _recorded(stream, blocks, loudness)
         heard_by = [(channels, array) for _, channels, array in ears]
         told = _heard_hops(samples, heard_by, settings.sample_rate_hz, settings.name, about)
-    truths = [
-        _truth(stream.vehicles, {event: levels[number] for event, levels in loudness.items()})
-        for number in range(len(arrays))
-    ]
+    truths = [_truth(stream.vehicles, loudness, number) for number in range(len(arrays))]
     return [HeardStream(one, *truths[number]) for one, (number, *_) in zip(told, ears, strict=True)]
 
 
@@ -330,10 +324,8 @@ def _heard_hops(
     about: Mapping[str, object],
 ) -> list[HopTable]:
     # Simulated microphones do not fail, and their monitoring takes a third of the time.
-    all_evidence = FrontEndSettings.heard_at(
-        sample_rate_hz, level_band_hz=LEVEL_BAND_HZ, watch_channels=False
-    )
-    front_ends = [FrontEnd(array, sample_rate_hz, all_evidence) for _, array in ears]
+    chosen = FrontEndSettings.heard_at(sample_rate_hz, level_band_hz=LEVEL_BAND_HZ, watch_channels=False)
+    front_ends = [FrontEnd(array, sample_rate_hz, chosen) for _, array in ears]
     frames, middles = [list[AcousticFrame]() for _ in ears], [list[Float32Array]() for _ in ears]
     for samples in blocks:
         for number, (channels, array) in enumerate(ears):
@@ -382,7 +374,9 @@ def _last_hops(middle: Float32Array, ends: list[int]) -> np.ndarray:
     return np.array([pcm[end - length : end] for end in ends], np.int16)
 
 
-def _truth(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray]) -> tuple[HopTable, HopTable]:
+def _truth(
+    every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray], array: int = 0
+) -> tuple[HopTable, HopTable]:
     """Return one row per vehicle, and one per vehicle and tenth of a second, as in `HeardStream`."""
     # Columns are typed one by one, because without any vehicle they would be columns of floats.
     motions = [one.event.manoeuvre for one in every]
@@ -404,8 +398,8 @@ def _truth(every: Sequence[VehicleTruth], loudness_db: Mapping[int, FloatArray])
             "x_m": distance * np.cos(azimuth),
             "y_m": distance * np.sin(azimuth),
             "in_view": _joined([one.in_view for one in every]).astype(np.bool_),
-            "loudness_db": _joined([loudness_db[one.number][0] for one in every]),
-            "band_db": _joined([loudness_db[one.number][1] for one in every]),
+            "loudness_db": _joined([loudness_db[one.number][array][0] for one in every]),
+            "band_db": _joined([loudness_db[one.number][array][1] for one in every]),
         }
     )
     return vehicles, rows

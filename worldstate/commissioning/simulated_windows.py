@@ -205,12 +205,9 @@ def drawn_source(rng: np.random.Generator) -> OpenSource:
     """
     speed = rng.uniform(*SPEEDS_MPS) if rng.random() < MOVING_SHARE else 0.0
     heading = rng.uniform(-np.pi, np.pi)
-    return OpenSource(
-        azimuth_rad=rng.uniform(-np.pi, np.pi),
-        distance_m=float(np.exp(rng.uniform(*np.log(DISTANCES_M)))),
-        velocity_mps=(speed * np.cos(heading), speed * np.sin(heading)),
-        snr_db=rng.uniform(*SNR_DB),
-    )
+    azimuth_rad, distance_m = rng.uniform(-np.pi, np.pi), float(np.exp(rng.uniform(*np.log(DISTANCES_M))))
+    velocity_mps = speed * np.cos(heading), speed * np.sin(heading)
+    return OpenSource(azimuth_rad, distance_m, velocity_mps, rng.uniform(*SNR_DB))
 
 
 def open_field_features(

@@ -347,10 +347,8 @@ def beside_reference(report: Mapping[str, object], reference: Mapping[str, float
     (130, '25       (56 microphones: 13.5)')
     """
     shown = "{:<8.4g} (56 microphones: {:.3g})"
-    both = {
-        name: (report[name], one) for name, one in reference.items() if isinstance(report.get(name), float)
-    }
-    return {**report, **{name: shown.format(*pair) for name, pair in both.items()}}
+    own = {name: one for name, one in report.items() if name in reference and isinstance(one, float)}
+    return {**report, **{name: shown.format(one, reference[name]) for name, one in own.items()}}
 
 
 def mounting_lines(mounted: Mapping[str, Figures]) -> list[str]:

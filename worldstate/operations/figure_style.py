@@ -93,9 +93,8 @@ def legend_beside(axes: "Axes", title: str | None = None) -> None:
     """Put the legend to the right of the axes, where it hides no data, with one entry per label."""
     handles, labels = axes.get_legend_handles_labels()
     once = dict(zip(labels, handles, strict=True))
-    axes.legend(
-        once.values(), once.keys(), title=title, loc="upper left", bbox_to_anchor=(1.0, 1.0), alignment="left"
-    )
+    beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "alignment": "left"}
+    axes.legend(once.values(), once.keys(), title=title, **beside)
 
 
 def draw_power(

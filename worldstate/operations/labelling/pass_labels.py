@@ -132,13 +132,10 @@ _LEAST_EDGE_STD_RAD = math.radians(0.5)
 # In the 2 s before T0, the deviation of simulated drivers from their pace at T0 equals white acceleration of
 # 0.015 to 0.04 m^2/s^3 in the median and 0.04 to 0.26 in the mean square. With 1 m^2/s^3 and a scale of 1 the
 # stated variance of hidden positions was four times the squared error. In a grid of densities and scales
-# (lab/NOTES.md) the values here have one of the smallest errors with a correct variance.
-_ACCELERATION_PSD, _MANOEUVRE_K = 0.03, 1.2
-# The lag is longer than a pass, which is solved once at its end. If the pass were relinearised before its
-# first box, the range would diverge and the system would be indeterminate.
-_SMOOTHING = SmoothingSettings(
-    lag_s=30.0, relinearize_every=1000, acceleration_psd=_ACCELERATION_PSD, manoeuvre_k=_MANOEUVRE_K
-)
+# (lab/NOTES.md) the values here have one of the smallest errors with a correct variance. The lag is longer
+# than a pass, which is solved once at its end. If the pass were relinearised before its first box, the range
+# would diverge and the system would be indeterminate.
+_SMOOTHING = SmoothingSettings(lag_s=30.0, relinearize_every=1000, acceleration_psd=0.03, manoeuvre_k=1.2)
 # Prior at the earliest hop: behind the corner, at walking pace to 15 m/s, about 10 to 100 m away.
 _START_STD = (math.radians(25.0), 0.25, 0.3, 0.6)
 _START_RAD, _START_M = math.radians(55.0), 30.0

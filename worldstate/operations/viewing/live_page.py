@@ -77,9 +77,8 @@ class LivePage:
         empty = PageData(title="worldstate live", remarks=[], t0_s=None, truth=[], states=[])
         self._page = page_html(empty, script.replace("@states@", STATES))
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(
-            target=self._loop.run_until_complete, args=(self._serve(),), daemon=True
-        )
+        serve = self._loop.run_until_complete
+        self._thread = threading.Thread(target=serve, args=(self._serve(),), daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -270,11 +270,9 @@ def headline(state: WorldState) -> str:
 
 
 def _hidden(cue: RiskCue) -> str:
-    within = (cue.within or {}).get("3")
-    chance = (
-        f"risk {cue.risk or 0.0:.2f}" if within is None else f"{100.0 * within:.0f} % to appear within 3 s"
-    )
-    return f"a vehicle is hidden, {chance}"
+    if (within := (cue.within or {}).get("3")) is None:
+        return f"a vehicle is hidden, risk {cue.risk or 0.0:.2f}"
+    return f"a vehicle is hidden, {100.0 * within:.0f} % to appear within 3 s"
 
 
 def is_reflected(state: WorldState) -> bool:
