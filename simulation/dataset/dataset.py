@@ -12,16 +12,7 @@ import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME
-from worldstate.adapters.datasets.ovad import (
-    ARRAY_NAME,
-    AUDIO_NAME,
-    COLUMNS,
-    DETECTION_NAMES,
-    FRAME_RATE_HZ,
-    LOG_NAME,
-    TRUTH_NAME,
-    OvadDataset,
-)
+from worldstate.adapters.datasets import ovad
 from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.file_io import atomic_path, read_json, write_json, write_rows
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
@@ -47,7 +38,14 @@ from worldstate.simulation.scene.settings import (
 )
 from worldstate.simulation.scene.vehicle import LENGTH_M, WIDTH_M
 
-from .recording import SimulatedRecording, put_in_place, refuse_foreign, simulate_recording, sound_writer
+from .recording import (
+    SimulatedRecording,
+    finished_folder,
+    put_in_place,
+    refuse_foreign,
+    simulate_recording,
+    sound_writer,
+)
 
 # The running number in an ID has four digits.
 MAX_RECORDINGS = 10_000
@@ -274,8 +272,8 @@ def write_dataset(
     folder, plans = Path(root), wanted.plans()
     folder.mkdir(parents=True, exist_ok=True)
     listed, listening = _listed(folder), ovad_array() if array is None else array
-    if (folder / ARRAY_NAME).exists():
-        _name_array(folder / ARRAY_NAME, listening)
+    if (folder / ovad.ARRAY_NAME).exists():
+        _name_array(folder / ovad.ARRAY_NAME, listening)
     folders = [_log_row(plan.environment, plan.approach, plan.number, 0).folder for plan in plans]
     for at in folders:
         refuse_foreign(folder / at)
@@ -287,7 +285,7 @@ def write_dataset(
                 if row is not None:
                     rows.append(row)
                     listed[at] = row
-                    _name_array(folder / ARRAY_NAME, listening)
+                    _name_array(folder / ovad.ARRAY_NAME, listening)
                     with deferred_signals():
                         try:
                             put_in_place(folder / at, Path(unlisted) / at)
@@ -342,29 +340,23 @@ def write_recording(
     in_range("number", number, 0, 9999)
     settings = recording.truth["settings"]
     row = _log_row(settings["site"]["name"], settings["approach"], number, recording.t0_frame)
-    target = Path(root) / row.folder
-    refuse_foreign(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    _name_array(Path(root) / ARRAY_NAME, recording.array)
-    with TemporaryDirectory(prefix=".simulated-", dir=target.parent) as folder:
-        temporary = Path(folder) / target.name
-        temporary.mkdir()
+    with finished_folder(Path(root) / row.folder) as temporary:
+        _name_array(Path(root) / ovad.ARRAY_NAME, recording.array)
         samples, channels = recording.audio.shape
-        with sound_writer(temporary / AUDIO_NAME, samples, channels, recording.sample_rate_hz) as file:
+        with sound_writer(temporary / ovad.AUDIO_NAME, samples, channels, recording.sample_rate_hz) as file:
             file.write(recording.audio)
         if recording.detections:
-            write_json(temporary / DETECTION_NAMES[0], to_json(list(recording.detections)))
-        write_json(temporary / TRUTH_NAME, recording.truth)
+            write_json(temporary / ovad.DETECTION_NAMES[0], to_json(list(recording.detections)))
+        write_json(temporary / ovad.TRUTH_NAME, recording.truth)
         if frames is not None:
             write_video(temporary / VIDEO_NAME, frames)
-        put_in_place(target, temporary)
     return row
 
 
 def write_log(root: str | Path, rows: Sequence[LogRow]) -> None:
     """Write `DataLog.csv`, which lists the recordings of a data set."""
     listed = ([row.recording_id, row.environment, row.approach, row.t0_frame] for row in rows)
-    write_rows(Path(root) / LOG_NAME, COLUMNS, listed, newline="\n")
+    write_rows(Path(root) / ovad.LOG_NAME, ovad.COLUMNS, listed, newline="\n")
 
 
 def _drawn(
@@ -388,7 +380,7 @@ def _simulate_one(
     plan, kept = item
     settings, rng = _drawn(wanted, array, plan)
     if kept is not None:
-        truth = read_json(kept / TRUTH_NAME, "a truth file")
+        truth = read_json(kept / ovad.TRUTH_NAME, "a truth file")
         if isinstance(truth, dict) and truth.get("settings") == json.loads(json.dumps(asdict(settings))):
             return None
     recording = simulate_recording(settings, rng, array)
@@ -415,9 +407,9 @@ def _name_array(path: Path, array: MicrophoneArray) -> None:
 
 def _listed(root: Path) -> dict[Path, LogRow]:
     """Return the recordings that the log of a data set lists and that exist."""
-    if not (root / LOG_NAME).exists():
+    if not (root / ovad.LOG_NAME).exists():
         return {}
-    found = [recording for recording in OvadDataset(root).recordings if recording.path.is_dir()]
+    found = [recording for recording in ovad.OvadDataset(root).recordings if recording.path.is_dir()]
     rows = [LogRow(r.recording_id, str(r.environment), str(r.label), r.logged_frame or 0) for r in found]
     return {row.folder: row for row in rows}
 
@@ -481,7 +473,7 @@ def write_video(path: str | Path, frames: Iterable[ImageArray]) -> None:
         raise InvalidArgumentError("frames: expected at least one")
     with atomic_path(path) as temporary:
         code = cv2.VideoWriter_fourcc(*CODEC)
-        writer = cv2.VideoWriter(str(temporary), code, FRAME_RATE_HZ, (first.shape[1], first.shape[0]))
+        writer = cv2.VideoWriter(str(temporary), code, ovad.FRAME_RATE_HZ, (first.shape[1], first.shape[0]))
         if not writer.isOpened():
             raise InputFileError(path, f"expected to write a video of {first.shape[1]} x {first.shape[0]} px")
         try:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -101,23 +102,12 @@ WAV_LIMIT_BYTES = (1 << 32) - (1 << 16)  # A WAV file has 32-bit sizes; a longer
 SAMPLE_BYTES = 3
 
 
-def sound_format(samples: int, channels: int) -> str:
-    """Return the container for a number of 24-bit samples.
-
-    Examples
-    --------
-    >>> sound_format(480_000, 56), sound_format(172_800_000, 56)
-    ('WAV', 'RF64')
-    """
-    return "RF64" if SAMPLE_BYTES * samples * channels > WAV_LIMIT_BYTES else "WAV"
-
-
 @contextmanager
 def sound_writer(
     path: Path, samples: int, channels: int, sample_rate_hz: float
 ) -> Iterator[soundfile.SoundFile]:
     """Open a file for a number of 24-bit samples, which are written at once or in blocks."""
-    kind = sound_format(samples, channels)
+    kind = "RF64" if SAMPLE_BYTES * samples * channels > WAV_LIMIT_BYTES else "WAV"
     try:
         with soundfile.SoundFile(path, "w", round(sample_rate_hz), channels, "PCM_24", format=kind) as file:
             yield file
@@ -130,6 +120,18 @@ def refuse_foreign(target: Path) -> None:
     """Refuse to replace a folder without simulated truth."""
     if target.exists() and not (target / TRUTH_NAME).is_file():
         raise InputFileError(target, "expected a free name or a simulated recording, found something else")
+
+
+@contextmanager
+def finished_folder(target: Path) -> Iterator[Path]:
+    """Yield a hidden folder beside `target`, on the same disk, and move it there when it is complete."""
+    refuse_foreign(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".simulated-", dir=target.parent) as hidden:
+        temporary = Path(hidden) / target.name
+        temporary.mkdir()
+        yield temporary
+        put_in_place(target, temporary)
 
 
 def put_in_place(target: Path, finished: Path) -> None:

@@ -11,6 +11,7 @@ so they are as loud as the screened sources. Reflections by the upper side of th
 import numpy as np
 
 from worldstate.ground.typing import Float32Array, FloatArray
+from worldstate.simulation.scene import vehicle
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.octave_bands import (
     OCTAVES_HZ,
@@ -20,15 +21,6 @@ from worldstate.simulation.scene.octave_bands import (
     split_octaves,
 )
 from worldstate.simulation.scene.presets import Preset
-from worldstate.simulation.scene.vehicle import (
-    HARMONIC_SHARE,
-    POWER_TO_1M_DB,
-    SLOWEST_KMH,
-    engine_lines,
-    octaves_of_lines,
-    propulsion_level_db,
-    rolling_level_db,
-)
 
 from .background import BlockGrid, WaveField, noise_frequencies, shaped_noise, wind_density
 from .diffraction import SPEED_OF_SOUND_MPS, screen_attenuation_db
@@ -194,16 +186,22 @@ def _add_sources(
 
 _PLACES_M = np.concatenate([TYRES_M, ENGINE_M[None], EXHAUST_M[None], PILLARS_M])
 # Share of each source's power in harmonics of the firing frequency
-_LINE_SHARES = (0.0,) * 4 + (HARMONIC_SHARE, HARMONIC_SHARE) + (0.0,) * 2
+_LINE_SHARES = (0.0,) * 4 + (vehicle.HARMONIC_SHARE, vehicle.HARMONIC_SHARE) + (0.0,) * 2
 
 
 def _levels_db(speed: FloatArray, engine_db: float, tyre_db: float) -> list[FloatArray]:
     """Return the pressure level of every source at 1 m per octave, (8, knots), dB re 20 uPa."""
-    slowest = SLOWEST_KMH / 3.6
+    slowest = vehicle.SLOWEST_KMH / 3.6
     # The law does not cover very low speeds; there, rolling noise fades with the speed.
     fade = 20.0 * np.log10(np.clip(speed / slowest, 1e-5, 1.0))
-    tyre = rolling_level_db(speed) + tyre_db + POWER_TO_1M_DB - 10.0 * np.log10(len(TYRES_M)) + fade
-    propulsion = propulsion_level_db(speed) + POWER_TO_1M_DB + engine_db
+    tyre = (
+        vehicle.rolling_level_db(speed)
+        + tyre_db
+        + vehicle.POWER_TO_1M_DB
+        - 10.0 * np.log10(len(TYRES_M))
+        + fade
+    )
+    propulsion = vehicle.propulsion_level_db(speed) + vehicle.POWER_TO_1M_DB + engine_db
     bay = propulsion + 10.0 * np.log10(1.0 - EXHAUST_SHARE)
     exhaust = propulsion + 10.0 * np.log10(EXHAUST_SHARE)
     relative = np.log10(np.maximum(speed, 0.1) / (70.0 / 3.6))
@@ -231,9 +229,9 @@ def _emission(firing: FloatArray, line_share: float, rate: float, rng: np.random
     noise = shaped_noise(2.0 * (1.0 - line_share) * shape**2, samples, rng)
     if line_share == 0.0:
         return noise
-    octave, crowd = octaves_of_lines(firing)
+    octave, crowd = vehicle.octaves_of_lines(firing)
     levels = np.sqrt(2.0 * line_share / crowd[octave]).astype(np.float32)
-    drawn = zip(levels, engine_lines(firing, np.cumsum(firing) / rate, rate, rng), strict=True)
+    drawn = zip(levels, vehicle.engine_lines(firing, np.cumsum(firing) / rate, rate, rng), strict=True)
     return np.asarray(noise + sum(level * line for level, line in drawn))
 
 

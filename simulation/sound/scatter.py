@@ -21,18 +21,9 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexA
 from worldstate.simulation.scene.junction import Site, site_generator
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ
 
+from . import paths
 from .delay import KNOT_SAMPLES, Emission
 from .diffraction import SPEED_OF_SOUND_MPS
-from .paths import (
-    ReceiverImage,
-    SourceImage,
-    near_facade,
-    on_wall,
-    receiver_images,
-    side_walls,
-    source_images,
-    through_mouth,
-)
 from .receiver import NEAREST_M, Receiver, add_along, add_turning, distance_m
 from .static_field import PlacedSource, StaticSources, StreetSound
 
@@ -80,7 +71,7 @@ def _side_walls(site: Site, rng: np.random.Generator) -> Patches:
     for y, openings, share in (left, right):
         x = _spread(-BEHIND_M, site.corner_ahead_m, rng)
         positions.append(np.column_stack([x, np.full_like(x, y), rng.uniform(*HEIGHTS_M, len(x))]))
-        walled.append(share * on_wall(openings, x))
+        walled.append(share * paths.on_wall(openings, x))
     normals = np.repeat([[0.0, -1.0], [0.0, 1.0]], list(map(len, positions)), axis=0)
     strengths = _strengths(len(normals), site.side_reflection, rng) * np.concatenate(walled)
     return Patches(np.concatenate(positions), normals, strengths, False)
@@ -116,8 +107,8 @@ FirstLeg: TypeAlias = tuple[FloatArray, FloatArray]
 def first_legs(group: Patches, index: int, source: PlacedSource, street: StreetSound) -> list[FirstLeg]:
     """Return the paths of one source to one patch: direct and by the facades of the crossing street."""
     if not group.beyond_mouth:
-        near = [image for image in source_images(street.site, source.x_m) if image.order <= IMAGE_ORDERS]
-        return [_mouth_leg(group, index, image, source, street) for image in near]
+        images = paths.source_images(street.site, source.x_m)[: IMAGE_ORDERS + 1]
+        return [_mouth_leg(group, index, image, source, street) for image in images]
     x, y, z = group.positions_m[index]
     away = np.stack([source.x_m - x, source.y_m - y], axis=1)
     length = np.sqrt((away**2).sum(axis=1) + (z - source.height_m) ** 2)
@@ -126,14 +117,14 @@ def first_legs(group: Patches, index: int, source: PlacedSource, street: StreetS
 
 
 def _mouth_leg(
-    group: Patches, index: int, image: SourceImage, source: PlacedSource, street: StreetSound
+    group: Patches, index: int, image: paths.SourceImage, source: PlacedSource, street: StreetSound
 ) -> FirstLeg:
     site, (x, y, z) = street.site, group.positions_m[index]
-    passage = through_mouth(site, (image.x_m, source.y_m), (x, y), z - source.height_m)
+    passage = paths.through_mouth(site, (image.x_m, source.y_m), (x, y), z - source.height_m)
     away = np.stack([np.full_like(source.y_m, site.corner_ahead_m - x), passage.aim_y_m - y], axis=1)
     cosine = np.abs(away @ group.normals[index]) / np.maximum(np.hypot(*away.T), NEAREST_M)
     length = passage.lit * passage.straight_m + (1.0 - passage.lit) * passage.bent_m
-    walls = image.gain * near_facade(site, image, source.y_m, passage.aim_y_m)
+    walls = image.gain * paths.near_facade(site, image, source.y_m, passage.aim_y_m)
     gain = group.strengths_m[index] * np.sqrt(cosine) * walls
     return length, gain[:, None] * passage.screen_gain(street.preset.screen_cap_db)
 
@@ -146,7 +137,7 @@ def last_leg(group: Patches, positions_m: FloatArray) -> tuple[FloatArray, Float
     return distance, np.sqrt(cosine) / distance
 
 
-def mirrored(group: Patches, image: ReceiverImage) -> Patches:
+def mirrored(group: Patches, image: paths.ReceiverImage) -> Patches:
     """Return the images of the patches in the side walls."""
     turn = np.array([1.0, image.sign])
     positions = (group.positions_m - np.array([0.0, image.offset_m, 0.0])) * np.array([1.0, image.sign, 1.0])
@@ -154,15 +145,16 @@ def mirrored(group: Patches, image: ReceiverImage) -> Patches:
 
 
 def seen_through_mouth(
-    site: Site, place_m: FloatArray, ego_x_m: FloatArray, image: ReceiverImage
+    site: Site, place_m: FloatArray, ego_x_m: FloatArray, image: paths.ReceiverImage
 ) -> FloatArray:
     """Return the share of a place in the crossing street that an ego receives by one image, 0 in shadow.
 
     Shapes: ego_x_m (T,).
     """
     end_m = ego_x_m, image.offset_m
-    passage = through_mouth(site, (float(place_m[0]), np.full_like(ego_x_m, place_m[1])), end_m, 0.0)
-    return passage.lit * image.gain * side_walls(site, image, ego_x_m, (site.corner_ahead_m, passage.aim_y_m))
+    passage = paths.through_mouth(site, (float(place_m[0]), np.full_like(ego_x_m, place_m[1])), end_m, 0.0)
+    walls = paths.side_walls(site, image, ego_x_m, (site.corner_ahead_m, passage.aim_y_m))
+    return passage.lit * image.gain * walls
 
 
 # Patches and images 30 dB below all scattered sound are left out; for a moving ego most of them are, at any
@@ -224,9 +216,7 @@ def _shown(group: Patches, arrived: Float32Array, street: StreetSound) -> list[_
         seen = np.ones((count, len(x)))
         return [_Shown(group, arrived, np.zeros(count, int), _last_gain(group, receiver), seen)]
     away, every = np.linalg.norm(group.positions_m - receiver.centre_m, axis=1), []
-    for image in receiver_images(site):
-        if image.order > IMAGE_ORDERS:
-            continue
+    for image in (one for one in paths.receiver_images(site) if one.order <= IMAGE_ORDERS):
         shown = mirrored(group, image)
         seen = np.stack([seen_through_mouth(site, place, x, image) for place in group.positions_m])
         # The path by a wall is longer: without its delay every image would be in phase with the patch.

@@ -4,7 +4,6 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.fft import rfft, rfftfreq
@@ -16,23 +15,13 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.ground import InvalidArgumentError, in_range
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.simulation.camera.simulated_detector import to_json
-from worldstate.simulation.dataset.recording import FULL_SCALE_PA, put_in_place, refuse_foreign, sound_writer
+from worldstate.simulation.dataset.recording import FULL_SCALE_PA, finished_folder, sound_writer
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 
+from . import truth
 from .arrivals import SoundEvent, draw_events, draw_sounds
 from .rendering import Block, Microphones, StreamScene, draw_microphones, render_blocks
 from .settings import StreamSettings
-from .truth import (
-    COLUMNS,
-    EVENTS_NAME,
-    ROWS_NAME,
-    VehicleTruth,
-    describe_events,
-    describe_stream,
-    detected_frames,
-    truth_rows,
-    vehicle_truth,
-)
 
 ARRIVALS, CHANNELS, LEVEL, SOUNDS = 0, 1, 2, 6  # Purposes of generators; 3 and 4 belong to the pieces
 
@@ -43,7 +32,7 @@ class DrawnStream:
 
     scene: StreamScene
     arrays: tuple[MicrophoneArray, ...]
-    vehicles: tuple[VehicleTruth, ...]
+    vehicles: tuple[truth.VehicleTruth, ...]
     sounds: tuple[SoundEvent, ...]
 
     def blocks(self, jobs: int = 1) -> Generator[Block, None, None]:
@@ -68,7 +57,7 @@ def draw_stream(settings: StreamSettings, *arrays: MicrophoneArray) -> DrawnStre
     return DrawnStream(
         StreamScene.drawn(settings, Microphones.joined(drawn), settings.generator(LEVEL)),
         arrays,
-        tuple(vehicle_truth(number, event, settings) for number, event in enumerate(events)),
+        tuple(truth.vehicle_truth(number, event, settings) for number, event in enumerate(events)),
         tuple(draw_sounds(settings, sizes, settings.generator(SOUNDS))),
     )
 
@@ -130,7 +119,7 @@ class WrittenStream:
 
     folder: Path
     settings: StreamSettings
-    vehicles: tuple[VehicleTruth, ...]
+    vehicles: tuple[truth.VehicleTruth, ...]
     sounds: tuple[SoundEvent, ...]
     spectrogram: Spectrogram  # Spectrogram of the microphone nearest to the array's centre
 
@@ -177,8 +166,7 @@ def write_stream(
 
     Examples
     --------
-    >>> from tempfile import TemporaryDirectory
-    >>> from worldstate.simulation import site
+    >>>     >>> from worldstate.simulation import site
     >>> pair = MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
     >>> settings = StreamSettings(site("SB1"), minutes=0.1, sample_rate_hz=6000.0)
     >>> with TemporaryDirectory() as root:
@@ -190,19 +178,12 @@ def write_stream(
     if not settings.ego.stands:
         got = f"{settings.site.name}: drives are heard, not written"
         raise InvalidArgumentError(f"site: expected one where the ego stands, got {got}")
-    folder = Path(root)
-    target = folder / settings.name
-    refuse_foreign(target)
-    folder.mkdir(parents=True, exist_ok=True)
-    stream = draw_stream(settings, ovad_array() if array is None else array)
-    # Beside the target on the same disk, so that the whole stream is renamed in one step.
-    with TemporaryDirectory(prefix=".simulated-", dir=folder) as hidden:
-        temporary = Path(hidden) / target.name
-        temporary.mkdir()
+    target = Path(root) / settings.name
+    with finished_folder(target) as temporary:
+        stream = draw_stream(settings, ovad_array() if array is None else array)
         heard, loudness = _write_sound(temporary / AUDIO_NAME, stream, jobs, progress)
         write_array_xml(temporary / ARRAY_NAME, stream.arrays[0])
         _write_beside(temporary, stream, loudness)
-        put_in_place(target, temporary)
     return WrittenStream(target, settings, stream.vehicles, stream.sounds, heard)
 
 
@@ -226,8 +207,8 @@ def _write_sound(
 def _write_beside(folder: Path, stream: DrawnStream, loudness: dict[int, FloatArray]) -> None:
     settings, vehicles = stream.scene.settings, stream.vehicles
     events = [one.event for one in vehicles]
-    frames = detected_frames(settings, events, stream.sounds, settings.generator(CAMERA))
+    frames = truth.detected_frames(settings, events, stream.sounds, settings.generator(CAMERA))
     write_json(folder / DETECTION_NAMES[0], to_json(frames))
-    write_json(folder / TRUTH_NAME, describe_stream(settings, vehicles))
-    write_json(folder / EVENTS_NAME, describe_events(vehicles, stream.sounds, loudness))
-    write_rows(folder / ROWS_NAME, COLUMNS, truth_rows(vehicles, loudness), newline="\n")
+    write_json(folder / TRUTH_NAME, truth.describe_stream(settings, vehicles))
+    write_json(folder / truth.EVENTS_NAME, truth.describe_events(vehicles, stream.sounds, loudness))
+    write_rows(folder / truth.ROWS_NAME, truth.COLUMNS, truth.truth_rows(vehicles, loudness), newline="\n")

@@ -156,7 +156,7 @@ def test_other_seeds_give_other_sound():
     assert np.abs(np.corrcoef(one[:, 0], two[:, 0])[0, 1]) < 0.2
 
 
-def test_a_folder_of_other_files_is_not_replaced(tmp_path):
+def test_a_folder_of_other_files_is_not_replaced(tmp_path, monkeypatch):
     scene = SimulationSettings(site("SA1"), "none", duration_s=0.5, sample_rate_hz=8_000.0)
     recording = simulate_recording(scene, np.random.default_rng(1), PAIR)
     foreign = tmp_path / "SA1" / "none" / "2_00_0003"
@@ -166,7 +166,9 @@ def test_a_folder_of_other_files_is_not_replaced(tmp_path):
         write_recording(tmp_path, recording, 3)
     assert (foreign / "notes.txt").read_text() == "mine"
     row = write_recording(tmp_path, recording, 4)
+    monkeypatch.setattr("worldstate.simulation.dataset.recording.WAV_LIMIT_BYTES", 3 * 2 * 4000 - 1)
     assert write_recording(tmp_path, recording, 4) == row  # its own kind
+    assert soundfile.info(tmp_path / row.folder / "out_multi.wav").format == "RF64"
 
 
 def test_the_sim_command_writes_and_reports(tmp_path, capsys):
