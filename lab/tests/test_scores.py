@@ -14,9 +14,7 @@ from worldstate_lab.metrics.intervals import calibration_error_sampling, stratif
 from worldstate_lab.metrics.track_measures import gated_median_deg
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
 
-from worldstate.abduction.cueing.risk_map import (
-    expected_calibration_error,
-)
+from worldstate.abduction.cueing.risk_map import expected_calibration_error
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.recordings.hop_table import HopTable
 
@@ -207,23 +205,9 @@ def test_figures_are_means_over_seeds():
 
 def test_a_method_that_no_seed_changes_is_scored_once():
     trials, (answers,) = random_study(np.random.default_rng(9))
-    score, thrice = Score.of(trials, [answers]), Score.of(trials, [answers] * 3)
-    close(thrice.figures(), score.figures())
-    assert thrice.wins.shape == score.wins.shape
+    assert len(Score.of(trials, [answers] * 3).wins) == 1
     # Copies may differ in fields that are not compared: they are scored like any other pass.
     assert len(Score.of(trials, [answers, [replace(one) for one in answers]]).wins) == 2
-
-
-def test_the_order_of_recordings_changes_nothing():
-    rng = np.random.default_rng(3)
-    trials, passes = random_study(rng, seeds=2)
-    order = rng.permutation(len(trials))
-    turned = Score.of([trials[i] for i in order], [[answers[i] for i in order] for answers in passes])
-    straight = Score.of(trials, passes)
-    close(straight.figures(), turned.figures())
-    assert straight.worst_sites().keys() == turned.worst_sites().keys()
-    for name, worst in straight.worst_sites().items():
-        assert turned.worst_sites()[name] == (worst[0], pytest.approx(worst[1]))
 
 
 def test_a_mirrored_world_has_the_same_figures():
@@ -239,32 +223,15 @@ def test_a_mirrored_world_has_the_same_figures():
     ]
     turned = [
         replace(
-            said,
-            side=-said.side,
-            bearing_rad=-said.bearing_rad,
+            said, side=-said.side, bearing_rad=-said.bearing_rad,
             tracks=said.tracks.replace(azimuth_rad=-said.tracks.azimuth_rad),
         )
         for said in answers
-    ]
+    ]  # fmt: skip
     ours = Score.of(trials, [answers]).figures()
     close(ours, Score.of(mirrored, [turned]).figures())
     # A method that ignores the mirroring is right where it was wrong before.
     assert Score.of(mirrored, [answers]).figures()["side_correct"] != ours["side_correct"]
-
-
-def test_identical_recordings_have_intervals_without_width():
-    near, calm = made_up("a", "left"), made_up("c")
-    rng = np.random.default_rng(0)
-    answers = [random_answer(near, rng), random_answer(calm, rng)]
-    score = Score.of([near] * 5 + [calm] * 5, [[answers[0]] * 5 + [answers[1]] * 5])
-    figures, intervals = score.figures(), score.intervals(stratified_draws(score.strata, rng, 50))
-    del intervals["false_alarms_per_hour_poisson"]
-    close({name: (value, value) for name, value in figures.items()}, intervals)
-
-
-def test_a_study_with_every_kind_of_decision_has_every_figure():
-    trials, passes = random_study(np.random.default_rng(6), seeds=2)
-    assert all(np.isfinite(value) for value in Score.of(trials, passes).figures().values())
 
 
 def detector(trials, rate, rng):

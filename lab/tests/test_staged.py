@@ -10,7 +10,7 @@ from worldstate_lab.cli.main import main
 from worldstate_lab.degradation.conditions import Condition
 from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.sequences import staged_video
-from worldstate_lab.sequences.recordings import NANODET_BOXES, read_boxes, read_recordings
+from worldstate_lab.sequences.recordings import read_boxes, read_recordings
 from worldstate_lab.sequences.staged_looks import (
     box_choices,
     left_out_choices,
@@ -161,7 +161,3 @@ def test_the_command_stages_and_prints_its_counts(folder, tmp_path, monkeypatch,
     assert all(one is None or 0.0 <= np.ravel(one)[0] <= 1.0 for one in rates)
     assert main(words) == 0
     assert "camera alone" in capsys.readouterr().out
-
-
-def test_the_filter_of_accepted_boxes_is_defined_once():
-    assert (NANODET_BOXES.min_score, NANODET_BOXES.min_height_px) == (0.3, 60.0)

@@ -17,20 +17,15 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.simulation.dataset.dataset import DatasetSettings, write_dataset
 
 TABLE_ONE = (
-    "Vision-only",
-    "Radar field-of-view model",
-    "OC-SORT recovery (stock)",
-    "OC-SORT recovery (coasting)",
-    "published",
-    "published, sustained",
-    "proposed .01",
-    "proposed .02",
-    "proposed .05",
-    "proposed .02 + looming",
-    "with absence .02",
-    "shipped model",
-    "+ site adaptation",
-    "world-state advisory",
+    *("Vision-only", "Radar field-of-view model", "OC-SORT recovery (stock)", "OC-SORT recovery (coasting)"),
+    *("published", "published, sustained", "proposed .01", "proposed .02", "proposed .05"),
+    *(
+        "proposed .02 + looming",
+        "with absence .02",
+        "shipped model",
+        "+ site adaptation",
+        "world-state advisory",
+    ),
 )
 
 
