@@ -192,18 +192,14 @@ def test_radar_waves_do_not_turn_corners(azimuth_rad, entry):
 
 
 @pytest.mark.parametrize(("azimuth_deg", "share"), [(30.0, 0.9), (-59.0, 0.9), (61.0, 0.0), (-120.0, 0.0)])
-def test_radar_detects_vehicles_in_view_at_its_stated_rate(azimuth_deg, share):
+def test_radar_detects_vehicles_in_view_at_its_stated_rate_in_any_order(azimuth_deg, share):
     of = trial(hops=4000, truth=truth(np.radians(azimuth_deg), True, 4010))
-    assert said(RadarFieldOfView(), of).alarm.mean() == pytest.approx(share, abs=0.02)
-
-
-def test_radar_gives_the_same_decisions_in_any_order():
     decide = RadarFieldOfView().fit([], np.random.default_rng(3))
-    of = trial(truth=truth(0.3, True))
     first = decide(of).alarm
+    assert first.mean() == pytest.approx(share, abs=0.02)
     decide(trial(truth=truth(-0.2, True)))
     np.testing.assert_array_equal(decide(of).alarm, first)
-    assert not np.array_equal(said(RadarFieldOfView(), of).alarm, first)
+    assert share == 0.0 or not np.array_equal(said(RadarFieldOfView(), of).alarm, first)
 
 
 def test_without_a_camera_there_are_no_alarms():

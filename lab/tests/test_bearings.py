@@ -25,7 +25,7 @@ def test_hops_without_a_bearing_are_the_least_sure_ones() -> None:
 
 def test_a_source_in_the_open_is_located_by_the_front_end_and_by_peers() -> None:
     # The first seed with a scene in the open.
-    number = next(n for n in range(20) if not drawn_scene(np.random.default_rng((1, n))).indoors)
+    number = next(n for n in range(20) if not drawn_scene(np.random.default_rng((1, n)))[3])
     indoors, bearings = scene_bearings(number, 1)
     assert not indoors
     for errors in (bearings.error_rad, *bearings.peers_rad.values()):

@@ -32,7 +32,7 @@ from worldstate.cli.common.progress import track
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.stream_exam import NEAR_M
 from worldstate.frontend.array.microphone_array import SPEED_OF_SOUND_M_S, MicrophoneArray
-from worldstate.frontend.settings import BEARING_HOPS, FrontEndSettings
+from worldstate.frontend.settings import BEARING_HOPS
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.checks import in_range
@@ -51,18 +51,11 @@ SPAN_DEG = 360.0
 SURE, FAR_RAD = 1.0 / 6.0, np.radians(60.0)  # A larger error belongs to another peak
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """A ring, its sound, and the position of the source."""
+def drawn_scene(rng: np.random.Generator) -> tuple[MicrophoneArray, Float32Array, float, bool]:
+    """Draw a ring and a source of noise that falls by 3 dB per octave, in a room or in the open.
 
-    array: MicrophoneArray
-    sound: Float32Array  # shape (n, M)
-    azimuth_rad: float
-    indoors: bool
-
-
-def drawn_scene(rng: np.random.Generator) -> Scene:
-    """Draw a ring and a source of noise that falls by 3 dB per octave, in a room or in the open."""
+    Return the ring, its sound (n, M), the azimuth of the source in radians, and whether it is a room.
+    """
     pyroomacoustics = _peer()
     count, radius_m = int(rng.integers(4, 9)), rng.uniform(0.03, 0.1)
     round_rad = 2.0 * np.pi * np.arange(count) / count
@@ -77,13 +70,15 @@ def drawn_scene(rng: np.random.Generator) -> Scene:
         room = pyroomacoustics.AnechoicRoom(fs=RATE_HZ)
     middle = size * [0.5, 0.5, 0.4] + rng.uniform(-0.5, 0.5, 3) * [1.0, 1.0, 0.5]
     away = rng.uniform(1.0, 1.9) * np.array([np.cos(azimuth), np.sin(azimuth), rng.uniform(-0.2, 0.2)])
-    room.add_source(middle + away, signal=_falling_noise(rng))
+    spectrum = np.fft.rfft(rng.standard_normal(round(LASTS_S * RATE_HZ)))
+    source = np.fft.irfft(spectrum / np.sqrt(np.arange(len(spectrum)) + 1.0))
+    room.add_source(middle + away, signal=source)
     room.add_microphone_array((middle + ring).T)
     room.simulate()
     clean = room.mic_array.signals.T[: round(LASTS_S * RATE_HZ)]
     noise = np.std(clean) * 10.0 ** (-rng.uniform(5.0, 20.0) / 20.0) * rng.standard_normal(clean.shape)
     sound = (0.1 / np.std(clean) * (clean + noise)).astype(np.float32)
-    return Scene(MicrophoneArray(ring), sound, float(azimuth), indoors)
+    return MicrophoneArray(ring), sound, float(azimuth), indoors
 
 
 def _peer() -> Any:
@@ -92,11 +87,6 @@ def _peer() -> Any:
     except ImportError as error:
         raise MissingExtraError("pyroomacoustics", "oracles") from error
     return pyroomacoustics
-
-
-def _falling_noise(rng: np.random.Generator) -> FloatArray:
-    spectrum = np.fft.rfft(rng.standard_normal(round(LASTS_S * RATE_HZ)))
-    return np.fft.irfft(spectrum / np.sqrt(np.arange(len(spectrum)) + 1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,35 +130,28 @@ def _median_deg(errors_rad: FloatArray) -> float:
 
 def scene_bearings(number: int, seed: int) -> tuple[bool, Bearings]:
     """Return whether a scene is a room, and its bearings with those of peers."""
-    scene = drawn_scene(np.random.default_rng((seed, number)))
-    settings = ListenSettings(azimuth_span_deg=SPAN_DEG).front_end(scene.array, RATE_HZ)
-    frames = FrontEnd(scene.array, RATE_HZ, settings).process(scene.sound)[::BEARING_HOPS]
+    array, sound, azimuth_rad, indoors = drawn_scene(np.random.default_rng((seed, number)))
+    settings = ListenSettings(azimuth_span_deg=SPAN_DEG).front_end(array, RATE_HZ)
+    frames = FrontEnd(array, RATE_HZ, settings).process(sound)[::BEARING_HOPS]
     found = np.array([one.bearing_rad for one in frames])
     stated = np.array([one.prominence > one.least_prominence for one in frames])
     std_rad = np.where(stated, [one.bearing_std_rad for one in frames], np.inf)
-    theirs = _of_peers(scene, settings, [one.sample_index for one in frames])
-    peers = {name: wrap_angle(one - scene.azimuth_rad) for name, one in theirs.items()}
-    return scene.indoors, Bearings(wrap_angle(found - scene.azimuth_rad), std_rad, peers)
-
-
-def _of_peers(scene: Scene, settings: FrontEndSettings, ends: Sequence[int]) -> Mapping[str, FloatArray]:
-    """Return the azimuths of pyroomacoustics' methods in the frames of every hop's bearing."""
-    nfft, band_hz, positions = settings.nfft, list(settings.srp_band_hz), scene.array.positions_m.T
-    spectra = StreamingStft(positions.shape[1], nfft, range(nfft // 2 + 1)).push(scene.sound)
+    # The frames of every hop's bearing, for pyroomacoustics' methods.
+    nfft, span = settings.nfft, BEARING_HOPS * HOP_S * RATE_HZ
+    spectra = StreamingStft(array.n_microphones, nfft, range(nfft // 2 + 1)).push(sound)
     done = nfft + np.arange(len(spectra)) * (nfft // 2)
-    found = {}
+    heard = [spectra[(done <= end) & (done > end - span)] for end in (one.sample_index for one in frames)]
+    heard = [one.transpose(2, 1, 0).astype(np.complex128) for one in heard]
+    peers = {}
     for name in PEERS:
-        method = getattr(_peer().doa, name)
-        peer = method(
-            positions, RATE_HZ, nfft, c=SPEED_OF_SOUND_M_S, num_src=1, azimuth=settings.azimuths_rad()
-        )
+        method, sector = getattr(_peer().doa, name), settings.azimuths_rad()
+        peer = method(array.positions_m.T, RATE_HZ, nfft, c=SPEED_OF_SOUND_M_S, num_src=1, azimuth=sector)
         azimuths = []
-        for end in ends:
-            mine = spectra[(done <= end) & (done > end - BEARING_HOPS * HOP_S * RATE_HZ)]
-            peer.locate_sources(mine.transpose(2, 1, 0).astype(np.complex128), freq_range=band_hz)
+        for one in heard:
+            peer.locate_sources(one, freq_range=list(settings.srp_band_hz))
             azimuths.append(float(peer.azimuth_recon[0]))
-        found[name] = np.array(azimuths)
-    return found
+        peers[name] = wrap_angle(np.array(azimuths) - azimuth_rad)
+    return indoors, Bearings(wrap_angle(found - azimuth_rad), std_rad, peers)
 
 
 def street_bearings(heard: HeardStream) -> Bearings:

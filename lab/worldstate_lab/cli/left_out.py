@@ -26,10 +26,9 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate import adapters, frontend
 from worldstate.abduction.sequence.sequence_model import SequenceModel
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.cli.common.inputs import add_array_options
+from worldstate.cli.common.inputs import add_array_options, given_array
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import progress_bar
 from worldstate.commissioning.alarm_curve import (
@@ -57,6 +56,7 @@ from worldstate.commissioning.heard_stream import (
 )
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import ExaminedStream, alarm_outcomes, examine
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.parallel import in_processes
 from worldstate.ground.typing import FloatArray
@@ -91,9 +91,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
-    settings, array = _settings(arguments), frontend.ovad_array()
-    if arguments.array is not None:
-        array = adapters.read_array(arguments.array)
+    moves: bool = arguments.moving_ego
+    settings = CommissionSettings(
+        junctions=arguments.junctions,
+        approach_minutes=MINUTES,
+        hazard_free_minutes=MINUTES / 1.2,
+        onsets_per_hour=ONSETS[moves],
+        seed=arguments.seed,
+        moving_ego=moves,
+    )
+    array = given_array(arguments) or ovad_array()
     plan, streams = learned_streams(settings), list[HeardStream]()
     if not any(one.traffic.hazard_free and not one.traffic.name.startswith(MISLEADING) for one in plan):
         raise InvalidArgumentError("--junctions: expected 3 or more to set the threshold")
@@ -109,18 +116,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     few = {name: caution(int(row["approaches"] or 0), "approaches") for name, row in rows.items()}
     lines = [f"{name}: {told}" for name, told in few.items() if told is not None]
     return CommandResult({"left_out": rows}, table={}, lines=[*figure_lines(rows, ".3f"), *lines])
-
-
-def _settings(arguments: argparse.Namespace) -> CommissionSettings:
-    moves: bool = arguments.moving_ego
-    return CommissionSettings(
-        junctions=arguments.junctions,
-        approach_minutes=MINUTES,
-        hazard_free_minutes=MINUTES / 1.2,
-        onsets_per_hour=ONSETS[moves],
-        seed=arguments.seed,
-        moving_ego=moves,
-    )
 
 
 def left_out_row(

@@ -17,11 +17,11 @@ Examples
 """
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -57,6 +57,7 @@ _NAMES = (
 _ROWS = tuple(one for one in (*METHODS, *GROUNDED) if one.name in _NAMES)
 _LEADS = ("1", "2")
 _PAPER = ("detection", "false_alarms_per_hour")
+_WORSE: Mapping[str, Literal["low", "high"]] = {"warned": "low", "alarms_per_hour": "high"}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -111,38 +112,24 @@ def _row(trials: Sequence[Trial], said: Sequence[Decisions], rng: np.random.Gene
     """Return the figures of one method, by junction, too."""
     areas = leads(trials, [one.score for one in said], None, rng)
     found = alarm_row(trials, [[one.alarm for one in said]], rng)
-    by_site = {site: alarm_row(*part, rng) for site, part in _by_site(trials, said)}
-    hazard = {lead: areas[lead]["auroc_by_junction"] for lead in _LEADS}
+    by_site = {}
+    for site in sorted({one.site for one in trials}):
+        here = [(trial, one.alarm) for trial, one in zip(trials, said, strict=True) if trial.site == site]
+        by_site[site] = alarm_row([trial for trial, _ in here], [[alarm for _, alarm in here]], rng)
     worst = {
-        "warned": worst_group({site: one["warned"] for site, one in by_site.items()}, "low"),
-        "alarms_per_hour": worst_group(
-            {site: one["alarms_per_hour"] for site, one in by_site.items()}, "high"
-        ),
-        **{f"auroc_{lead}": worst_group(values, "low") for lead, values in hazard.items()},
+        name: worst_group({site: one[name] for site, one in by_site.items()}, worse)
+        for name, worse in _WORSE.items()
     }
+    worst |= {f"auroc_{lead}": worst_group(areas[lead]["auroc_by_junction"], "low") for lead in _LEADS}
     return found | {"leads": {lead: areas[lead] for lead in _LEADS}, "by_junction": by_site, "worst": worst}
 
 
-def _by_site(
-    trials: Sequence[Trial], said: Sequence[Decisions]
-) -> Iterator[tuple[str, tuple[list[Trial], list[list[Any]]]]]:
-    for site in sorted({one.site for one in trials}):
-        rows = [i for i, one in enumerate(trials) if one.site == site]
-        yield site, ([trials[i] for i in rows], [[said[i].alarm for i in rows]])
-
-
 def _tables(protocol: Protocol, rows: Mapping[str, Any]) -> list[Table]:
-    heads = (
-        "row",
-        "auroc 1 s",
-        "auroc 2 s",
-        *(f"worst {name}" for name in next(iter(rows.values()))["worst"]),
-    )
+    worst = (f"worst {name}" for name in next(iter(rows.values()))["worst"])
+    heads = ("row", "auroc 1 s", "auroc 2 s", *worst, "paper")
     cells = [(name, *_cells(row)) for name, row in rows.items()]
-    return [
-        alarm_table(rows, "row", protocol.title),
-        Table("junctions", f"{protocol.title}: hazard, and the worst junction", (*heads, "paper"), cells),
-    ]
+    title = f"{protocol.title}: hazard, and the worst junction"
+    return [alarm_table(rows, "row", protocol.title), Table("junctions", title, heads, cells)]
 
 
 def _cells(row: Mapping[str, Any]) -> tuple[Cell, ...]:

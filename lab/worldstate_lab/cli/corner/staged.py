@@ -51,12 +51,7 @@ from worldstate_lab.sequences.staged_looks import (
     vision_row,
     watched_images,
 )
-from worldstate_lab.sequences.staged_video import (
-    Staging,
-    milliseconds_a_search,
-    stage_recording,
-    staging_of,
-)
+from worldstate_lab.sequences.staged_video import Staging, milliseconds_a_search, stage_recording, staging_of
 from worldstate_lab.trials.trial import Decisions, Trial
 
 _PRINTED_CHOICES = 10
@@ -95,9 +90,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         "vision": {one.state: one for one in rows},
     }
     tables = [*choice_tables, *_beta_tables(curves), _vision_table(rows)]
-    return CommandResult(
-        plain(report), table={}, lines=[line for one in tables for line in ("", *one.lines())]
-    )
+    lines = [line for one in tables for line in ("", *one.lines())]
+    return CommandResult(plain(report), table={}, lines=lines)
 
 
 def _stage(staging: Staging, recordings: Sequence[CornerRecording], jobs: int) -> None:
@@ -119,15 +113,8 @@ def _choice(recordings: Sequence[CornerRecording]) -> tuple[dict[str, Any], list
     shown = [_choice_row(one) for one in tried[:_PRINTED_CHOICES]]
     others: list[tuple[Cell, ...]] = [(junction, *_choice_row(one)) for junction, one in left_out.items()]
     title = f"Minimum score and height, the best {len(shown)} of {len(tried)}"
-    tables = [
-        Table("choice", title, columns, shown),
-        Table(
-            "left_out",
-            "Choice without a junction, and its shares there",
-            ("junction", *columns),
-            others,
-        ),
-    ]
+    at = "Choice without a junction, and its shares there"
+    tables = [Table("choice", title, columns, shown), Table("left_out", at, ("junction", *columns), others)]
     return {"tried": tried, "left_out": left_out}, tables
 
 
@@ -139,11 +126,11 @@ def _beta_report(curves: BetaCurves) -> dict[str, Any]:
     """Return beta by family, angle and level, and how often it falls with the level."""
     levels = range(curves.looks.shape[2])
     falls = {
-        along: {
-            "count": sum(one.along == along for one in curves.falls),
-            "certain": sum(one.along == along and one.certain for one in curves.falls),
-        }
-        for along in ("degradation", "azimuth")
+        along: [one for one in curves.falls if one.along == along] for along in ("degradation", "azimuth")
+    }
+    counted = {
+        along: {"count": len(some), "certain": sum(one.certain for one in some)}
+        for along, some in falls.items()
     }
     by_angle = {
         family: {name: [_beta(curves, i, b, level) for level in levels] for b, name in enumerate(curves.bins)}
@@ -153,7 +140,7 @@ def _beta_report(curves: BetaCurves) -> dict[str, Any]:
         family: [_beta(curves, i, None, level) for level in levels] for i, family in enumerate(FAMILIES)
     }
     looks = dict(zip(curves.bins, curves.looks[0, :, 0].tolist(), strict=True))
-    return {"by_angle": by_angle, "overall": overall, "looks": looks, "falls": falls}
+    return {"by_angle": by_angle, "overall": overall, "looks": looks, "falls": counted}
 
 
 def _beta(curves: BetaCurves, family: int, azimuth: int | None, level: int) -> Value:
