@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_evaluation import HOPS, approach, calm
 from worldstate_lab.cli.main import keep_results, main, read_results, result_key
 from worldstate_lab.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
 from worldstate_lab.degradation.beta_curves import Band, BetaCurves
@@ -134,29 +135,6 @@ def test_area_under_the_drawn_curve_is_the_auroc(seed):
     assert np.trapezoid(*roc_curve(high, low)[::-1]) == pytest.approx(area)
 
 
-def heard(name, site, label, seed):
-    """Return a recording whose likelihoods rise in the last two seconds before T0."""
-    rng = np.random.default_rng(seed)
-    time_s = 1.0 + 0.1 * np.arange(60)
-    near = (label != "none") & (time_s > 3.0) & (time_s < 5.0)
-    logits = rng.normal(0.0, 0.8, (60, 4)) + 2.5 * near[:, None] * np.eye(4)[0 if label == "left" else 1]
-    posterior = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
-    seen = np.where((label != "none") & (time_s > 5.0), 0.3, np.nan)
-    columns = {
-        "time_s": time_s, "shipped": posterior, "published": posterior, "reference_rad": seen,
-        "bearing_rad": np.full(60, 0.31), "srp_rad": np.full(60, 0.31), "music_rad": np.full(60, 0.4),
-        "prominence": 1.0 + rng.random(60), "log_slope_hz": rng.normal(0.0, 1.0, 60),
-        "approach": np.full(60, np.nan),
-        "answer": np.zeros(60, np.int64), "miss_rate": np.ones(60), "clutter_rate": np.zeros(60),
-        "seen": np.isfinite(seen), "there": np.isfinite(seen), "features": np.zeros((60, 60)),
-    }  # fmt: skip
-    about = {
-        "site": site, "moving": False, "fingerprint": name, "doppler": "no tone", "pass_s": 6.0,
-        "prior": {"shipped": [0.25] * 4, "published": [0.25] * 4},
-    }  # fmt: skip
-    return Trial(HopTable(columns, name, label, math.nan if label == "none" else 5.0, about))
-
-
 METHODS = (
     VisionOnly(),
     PublishedRule("published"),
@@ -178,11 +156,14 @@ def run_of(protocol, trials):
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
-    sides = ("left", "none", "right", "none")
+    rng, burst = np.random.default_rng(0), tuple(range(20, 27))
+    made = [(f"{i}", approach(i, rng, lead_s=2.0)) for i in range(8)]
+    made += [(f"none{i}", calm(i, rng, false_alarms=burst if i % 3 else ())) for i in range(8)]
     trials = [
-        heard(f"{site}_{i}", site, sides[i % 4], 10 * j + i)
-        for j, site in enumerate(("SA1", "SB1"))
-        for i in range(8)
+        replace(
+            one, hops=one.hops.replace(name=name, about={**one.hops.about, "site": ("SA1", "SB1")[i % 2]})
+        )
+        for i, (name, one) in enumerate(made)
     ]
     root = tmp_path_factory.mktemp("streets")
     takes = TakeList(root, tuple(Take(root / t.name, t.name, t.site, t.label) for t in trials), (), (), False)
@@ -231,7 +212,7 @@ def test_the_report_contains_every_number_of_the_paper_with_the_measured_one(eva
 
 def test_every_table_states_its_data_and_every_mean_its_worst_junction(evaluation, tmp_path):
     blocks = {block.name: block for block in evaluation_document(evaluation).blocks}
-    hours = 8 * 60 * 0.1 / 3600.0
+    hours = 8 * HOPS * 0.1 / 3600.0
     told = f"16 recordings: 8 approaches and 8 hazard-free, {hours:.3f} h."
     assert {"table_i", "equal_detection", "calibration", "protocol_junctions_fixed"} <= {
         name for name, block in blocks.items() if block.caption.startswith(told)
