@@ -24,18 +24,13 @@ def hops(name, label, t0_s, *, advised, present, seen):
     return HopTable(columns, name, label, t0_s, {"site": "SA1"})
 
 
-def test_a_high_presence_without_a_detection_counts_as_awareness():
-    streams = [hops(f"f{i}", "none", np.nan, advised=False, present=0.1, seen=False) for i in range(5)]
-    streams += [hops(f"a{i}", "left", 2.0, advised=i < 3, present=0.9, seen=False) for i in range(5)]
+@pytest.mark.parametrize(("quiet", "present", "aware"), [(0.1, 0.9, 1.0), (0.5, 0.5, 0.0)])
+def test_a_presence_above_that_of_quiet_streets_counts_as_awareness(quiet, present, aware):
+    streams = [hops(f"f{i}", "none", np.nan, advised=False, present=quiet, seen=False) for i in range(5)]
+    streams += [hops(f"a{i}", "left", 2.0, advised=i < 3, present=present, seen=False) for i in range(5)]
     row = product_row(streams, np.random.default_rng(0))
     assert (row["warned"], row["approaches"], row["onsets"]) == (3, 5, 0)
-    assert (row["aware"], row["vision_only"], row["hazard_free_aware_SA1"]) == (1.0, 0.0, 0.0)
-
-
-def test_a_presence_as_high_as_in_quiet_streets_is_not_awareness():
-    streams = [hops(f"f{i}", "none", np.nan, advised=False, present=0.5, seen=False) for i in range(5)]
-    streams += [hops(f"a{i}", "left", 2.0, advised=False, present=0.5, seen=False) for i in range(5)]
-    assert product_row(streams, np.random.default_rng(0))["aware"] == 0.0
+    assert (row["aware"], row["vision_only"], row["hazard_free_aware_SA1"]) == (aware, 0.0, 0.0)
 
 
 @pytest.mark.long

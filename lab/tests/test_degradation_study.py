@@ -374,4 +374,4 @@ def test_the_study_end_to_end_then_from_its_cache_and_without_a_broken_recording
     assert values["detectors"]["mog2"]["rows"][0]["awareness"] == list(sweep.awareness.rows[0].awareness)
     assert values["skipped"].keys() == {broken.recording_id}
     assert any(line.startswith("noise 0.75") for table in sweep_tables(first) for line in table.lines())
-    assert sweep.least_vision.vision.value <= 0.05 < 0.5 < sweep.awareness.row(CLEAN).vision.value
+    assert sweep.least_vision.vision.value <= 0.05 < 0.5 < sweep.awareness.rows[0].vision.value

@@ -65,6 +65,10 @@ def changed(one, **columns):
     return {state: table.replace(**columns) for state, table in one.items()}
 
 
+def row_of(found, name):
+    return next(one for one in found.rows if one.condition.name == name)
+
+
 def judged(corpus):
     kinds = [one[CLEAN].hazard_free for one in corpus]
     draws = stratified_draws(kinds, np.random.default_rng(1), draws=200)
@@ -89,11 +93,11 @@ def test_vision_alone_decreases_as_one_minus_beta_and_awareness_does_not(found):
         assert row.awareness.value >= row.vision.value
         for figure in (row.vision, row.awareness, row.false_alarms_per_hour, row.false_awareness_per_hour):
             assert figure.low <= figure.value <= figure.high
-    blind = found.row("noise 1")
+    blind = row_of(found, "noise 1")
     assert blind.vision == (0.0, 0.0, 0.0)
-    assert blind.awareness.value == pytest.approx(found.row(OFF).awareness.value)
+    assert blind.awareness.value == pytest.approx(row_of(found, OFF).awareness.value)
     assert blind.awareness.value > 0.6
-    assert 0.0 < found.row("blur 0.5").awareness.high - found.row("blur 0.5").awareness.low < 0.5
+    assert 0.0 < row_of(found, "blur 0.5").awareness.high - row_of(found, "blur 0.5").awareness.low < 0.5
 
 
 def test_awareness_is_counted_as_it_is_defined(corpus):
@@ -114,7 +118,7 @@ def test_awareness_is_counted_as_it_is_defined(corpus):
 
 def test_false_alarms_keep_the_budget_of_the_clean_recording(found, corpus):
     """The statistic falls as absence becomes weaker, and a detector without clutter adds no awareness."""
-    clean, hours = found.row(CLEAN), found.hazard_free_hours
+    clean, hours = row_of(found, CLEAN), found.hazard_free_hours
     dry = [row for row in found.rows if not row.condition.sound_level]
     assert all(row.false_alarms_per_hour.value <= clean.false_alarms_per_hour.value + 1e-9 for row in dry)
     assert hours == pytest.approx(sum(one[CLEAN].hazard_free for one in corpus) * HOPS * 0.1 / 3600.0)
@@ -135,12 +139,12 @@ def test_a_common_cause_costs_more_than_each_effect_alone(found):
     assert harshest.roof.value > 0.9
     assert harshest.lens.value > 0.6
     assert harshest.rain.value < 0.5
-    clean = found.row(CLEAN).awareness.value
+    clean = row_of(found, CLEAN).awareness.value
     assert harshest.additive.value == pytest.approx(harshest.lens.value + harshest.roof.value - clean)
     assert harshest.optimism.value == pytest.approx(harshest.additive.value - harshest.rain.value)
     assert harshest.optimism.low > 0.2
     assert [one.noise_db for one in found.common_cause] == [-20.0, -10.0, 0.0, 10.0]
-    assert found.row("rain 1").vision == found.row("lens 1").vision
+    assert row_of(found, "rain 1").vision == row_of(found, "lens 1").vision
 
 
 def test_if_the_sound_alone_is_sufficient_the_effects_add_up(corpus):

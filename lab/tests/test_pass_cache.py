@@ -71,12 +71,7 @@ def test_a_pass_is_computed_once_for_each_key(tmp_path):
     assert cache.tables("sound", {"a": 2}, dict) == {} == cache.tables("sound", {"a": 2}, never)
     with pytest.raises(AssertionError):
         cache.tables("camera", {"a": 1}, never)
-
-
-def test_a_pass_that_fails_leaves_no_file(tmp_path):
-    with pytest.raises(AssertionError):
-        PassCache(tmp_path).tables("sound", 1, never)
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not [*(tmp_path / "cache" / "camera").iterdir()]
 
 
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:100], lambda data: bytes(len(data))])
@@ -103,10 +98,13 @@ def recording(folder):
     return folder
 
 
-def test_a_fingerprint_depends_only_on_the_content(tmp_path):
+def test_a_fingerprint_depends_only_on_the_content(tmp_path, monkeypatch):
     memo = tmp_path / "memo"
     one, other = recording(tmp_path / "one"), recording(tmp_path / "other")
     same = fingerprint(one, memo)
+    with monkeypatch.context() as unread:  # Unchanged files are not read again
+        unread.setattr(pass_cache, "content_hash", lambda path: never())
+        assert fingerprint(one, memo) == same
     assert fingerprint(other, memo) == same == fingerprint(one, tmp_path / "another")
     (one / "notes.txt").write_text("windy")
     os.utime(one / "out_multi.wav")
@@ -118,13 +116,6 @@ def test_a_fingerprint_depends_only_on_the_content(tmp_path):
     (one / "truth.json").unlink()
     seen.add(fingerprint(one, memo))
     assert len(seen) == 5
-
-
-def test_unchanged_files_are_not_read_again(tmp_path, monkeypatch):
-    memo, place = tmp_path / "memo", recording(tmp_path / "one")
-    before = fingerprint(place, memo)
-    monkeypatch.setattr(pass_cache, "content_hash", lambda path: never())
-    assert fingerprint(place, memo) == before
 
 
 def test_other_content_of_the_same_size_and_time_is_detected(tmp_path):

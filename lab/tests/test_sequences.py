@@ -16,7 +16,7 @@ from worldstate_lab.cli.main import main, read_results
 from worldstate_lab.methods.line_of_sight import OcSortRecovery
 from worldstate_lab.sequences.path_figures import exam_figures
 from worldstate_lab.sequences.path_tables import alarm_table
-from worldstate_lab.sequences.recordings import NANODET_BOXES, read_recordings
+from worldstate_lab.sequences.recordings import NANODET_BOXES
 from worldstate_lab.sequences.scores import alarm_row, calibration, curve, hop_before, leads, sweep
 from worldstate_lab.sequences.window_rows import FILTERS
 
@@ -82,12 +82,6 @@ def test_hops_of_a_cut_start_are_not_counted() -> None:
     assert [cut[lead]["approaches"] for lead in ("2", "3")] == [4, 0]
     assert cut["3"]["hazard_free"] == 0
     assert np.isnan(cut["3"]["auroc"])
-
-
-def test_a_cut_recording_keeps_the_time_before_t0(tmp_path) -> None:
-    one = read_recordings(write_corner(tmp_path / "corner", draw()))[0]
-    later = one.cut(1.0)
-    assert (later.t0_s, later.length_s, later.start_s) == (2.0, 3.0, 1.0)
 
 
 def test_an_alarm_at_the_first_hop_is_an_onset_with_its_lead() -> None:
@@ -260,16 +254,12 @@ def test_unsuitable_options_are_rejected(tmp_path, capsys, words, problem) -> No
     assert problem in capsys.readouterr().err
 
 
-def test_recordings_of_one_kind_are_rejected(tmp_path, capsys) -> None:
-    assert main(["sequences", str(write_corner(tmp_path / "corner", draw(), hazard_free=0))]) == 2
-    assert "found one kind" in capsys.readouterr().err
-
-
-def test_an_unreadable_folder_is_rejected_with_its_problem(tmp_path, capsys) -> None:
-    folder = write_corner(tmp_path / "corner", draw())
+@pytest.mark.parametrize(("hazard_free", "problem"), [(0, "found one kind"), (2, "srp.npz")])
+def test_unsuitable_recordings_are_rejected(tmp_path, capsys, hazard_free, problem) -> None:
+    folder = write_corner(tmp_path / "corner", draw(), hazard_free=hazard_free)
     (folder / "srp.npz").unlink()
     assert main(["sequences", str(folder)]) == 2
-    assert "srp.npz" in capsys.readouterr().err
+    assert problem in capsys.readouterr().err
 
 
 def test_figures_of_the_simulated_exam_are_printed_beside_the_same_real_figures(tmp_path) -> None:

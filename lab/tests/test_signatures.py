@@ -1,15 +1,20 @@
 """The signature study: separability by a linear signature, on other recordings and on the other corpus."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import butter, sosfilt
+from test_traffic_corpora import write_idmt, write_sound
 from worldstate_lab.cli.main import main
-from worldstate_lab.signatures.clip_signatures import ClipSignatures, signature, signature_edges_hz
+from worldstate_lab.signatures.clip_signatures import (
+    ClipSignatures,
+    hear_clips,
+    signature,
+    signature_edges_hz,
+)
 from worldstate_lab.signatures.signature_study import (
     area,
     balanced_accuracy,
@@ -19,63 +24,29 @@ from worldstate_lab.signatures.signature_study import (
     signature_study,
     transferred,
 )
-from worldstate_lab.signatures.traffic_clips import BACKGROUND, KINDS, ClipLabels
+from worldstate_lab.signatures.traffic_clips import BACKGROUND, KINDS, ClipLabels, melaudis
 
-RATE_HZ = 24_000.0
-# Amplitude of passing vehicles beside the background
-LOUD = {"car": 4.0, "truck": 6.0, "tram": 3.0, "electric": 2.0, "bicycle": 1.1}
-TOWN, CITY = ("car", "truck", "truck"), ("car", "truck", "tram", "electric", "bicycle")
-BAND = butter(2, (300.0, 1800.0), "bandpass", fs=RATE_HZ, output="sos")
-
-
-def recorded(kinds, microphones, number, splits=("",)):
-    """Yield the clips of one recording: noise, louder in one band if a vehicle passes."""
-    rng = np.random.default_rng(number)
-    for kind in (*kinds, *(BACKGROUND,) * 3):
-        for microphone in microphones:
-            street, vehicle = rng.normal(size=(2, round(2.0 * RATE_HZ)))
-            sound = 0.01 * (street + LOUD.get(kind, 0.0) * sosfilt(BAND, vehicle))
-            labels = ClipLabels(kind, microphone, str(number), "here", splits[number % len(splits)])
-            yield labels, np.float32(sound)[:, None]
+RATE_HZ = 24_000
 
 
 @pytest.fixture(scope="module")
-def city():
-    return [clip for number in range(2) for clip in recorded(CITY, ("phone",), number)]
-
-
-@pytest.fixture(scope="module")
-def folders(city, tmp_path_factory):
-    """Return clips in the layouts of IDMT-Traffic and of MELAUDIS."""
-    idmt, melaudis = (tmp_path_factory.mktemp(name) for name in ("idmt", "melaudis"))
-    lists = {"idmt_traffic_all": [], "eusipco_2021_train": [], "eusipco_2021_test": []}
-    for number in range(4):
-        clips = recorded(TOWN, ("studio", "mems"), number, ("train", "test"))
-        for middle, (labels, samples) in enumerate(clips, 100 * number):
-            is_street = labels.kind == BACKGROUND
-            what, end = ("", "-BG") if is_street else (f"_M_D_{labels.kind[0].upper()}L", "")
-            microphone = "SE_CH34" if labels.microphone == "studio" else "ME_CH12"
-            name = f"2019-11-12-15-3{number}_Site{number // 2}_50Kmh_{middle}{what}_{microphone}{end}.wav"
-            write_sound(idmt / "audio" / name, samples)
-            for file in ("idmt_traffic_all", f"eusipco_2021_{labels.split}"):
-                lists[file].append(name)
-    (idmt / "annotation").mkdir()
-    for file, names in lists.items():
-        (idmt / "annotation" / f"{file}.txt").write_text("\n".join(names))
-    tokens = {kind: token for token, kind in KINDS.items()}
-    for middle, (labels, samples) in enumerate(city):
-        spot = f"2024-01-1{labels.recording}_13-{middle}-0.0-Fitzroy1"
-        if labels.kind == BACKGROUND:
-            write_sound(melaudis / "MELAUDIS_BG" / f"{spot}.wav", samples)
-        elif labels.kind in tokens:
-            name = f"{spot}_FF_1V-{tokens[labels.kind]}_L1_2Lanes_LR_stereo.wav"
-            write_sound(melaudis / "MELAUDIS_Vehicles" / "Final_Veh" / "Fit1" / name, samples)
-    return idmt, melaudis
-
-
-def write_sound(path, samples):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    soundfile.write(path, np.repeat(samples, 2, axis=1), int(RATE_HZ), subtype="PCM_24")
+def folders(tmp_path_factory):
+    """Return four recordings of IDMT-Traffic, two of them for tests, and two days of MELAUDIS."""
+    idmt, city = (tmp_path_factory.mktemp(name) for name in ("idmt", "melaudis"))
+    names = [
+        f"2019-11-12-15-3{number}_Site{number // 2}_50Kmh_{10 * number + i}{what}_{microphone}{end}"
+        for number in range(4)
+        for i, (what, end) in enumerate([(f"_M_D_{one}L", "") for one in "CTT"] + [("", "-BG")] * 3)
+        for microphone in ("SE_CH34", "ME_CH12")
+    ]
+    write_idmt(idmt, names, [name for name in names if name[15] in "13"], RATE_HZ)
+    for day in (10, 11):
+        for i, token in enumerate((*KINDS, *["BG"] * 3)):
+            place = city / ("MELAUDIS_BG" if token == "BG" else "MELAUDIS_Vehicles")
+            write_sound(
+                place / f"2024-01-{day}_13-{i}-0.0-Fitzroy1_FF_1V-{token}_LR_stereo.wav", rate_hz=RATE_HZ
+            )
+    return idmt, city
 
 
 def drawn(rng, recordings, clips, *, fingerprint=0.0, lift=0.0):
@@ -116,13 +87,7 @@ def test_a_recording_is_never_scored_by_a_model_trained_on_it():
 def test_another_gain_shifts_the_threshold_but_not_the_area():
     rng = np.random.default_rng(2)
     home, away = (drawn(rng, recordings=10, clips=20, lift=3.0) for _ in range(2))
-    louder = ClipSignatures.of(
-        "louder",
-        [
-            (ClipLabels(k, "phone", r, ""), e + 9.0)
-            for k, r, e in zip(away.kinds, away.recordings, away.energy, strict=True)
-        ],
-    )
+    louder = replace(away, energy=away.energy + 9.0)
     by_level, by_shape = (
         scores_of(louder, transferred(home, louder, by), louder.motor) for by in ("level", "shape")
     )
@@ -143,12 +108,12 @@ def test_clips_repeated_within_their_recordings_do_not_narrow_the_interval():
 
 @pytest.mark.long
 def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_path, capsys):
-    idmt, melaudis = folders
+    idmt, city = folders
     broken = next((idmt / "audio").glob("*_CL_SE_*"))
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
     try:
-        words = ["corpora", "--idmt", idmt, "--melaudis", melaudis, "--out", tmp_path, "--json"]
+        words = ["corpora", "--idmt", idmt, "--melaudis", city, "--out", tmp_path, "--json"]
         assert main([*map(str, words)]) == 0
     finally:
         broken.write_bytes(whole)
@@ -166,8 +131,8 @@ def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_p
     assert [problem for problem in report["left_out"] if broken.name in problem] == report["left_out"] != []
 
 
-def test_rows_of_a_missing_corpus_contain_the_command_that_computes_them(city):
-    table = ClipSignatures.of("city", [(labels, signature(samples, RATE_HZ)) for labels, samples in city])
+def test_rows_of_a_missing_corpus_contain_the_command_that_computes_them(folders):
+    table = hear_clips("city", melaudis(folders[1]))
     rows = signature_study(None, table, np.random.default_rng(0)).rows
     notes = {row.note for row in rows if row.value is None}
     assert "worldstate-lab corpora --idmt DIR" in notes

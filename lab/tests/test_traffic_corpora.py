@@ -2,6 +2,7 @@
 
 import re
 from itertools import product
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -26,19 +27,23 @@ PASSAGE = "2024-02-09_13-62-1.8-Fitzroy1_FF_1V-{}_L1_2Lanes_LR_stereo"
 
 
 def write_sound(path, seconds=CLIP_S, rate_hz=8000):
+    """Write noise that is louder if a vehicle passes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    noise = np.random.default_rng(len(path.name)).uniform(-0.1, 0.1, (round(seconds * rate_hz), 2))
-    soundfile.write(path, noise, rate_hz)
+    rng, most = (
+        np.random.default_rng(crc32(path.name.encode())),
+        0.1 if "BG" in path.parent.name + path.name else 0.3,
+    )
+    soundfile.write(path, rng.uniform(-most, most, (round(seconds * rate_hz), 2)), rate_hz)
 
 
-def write_idmt(root, names=IDMT_NAMES, test=IDMT_NAMES[2:]):
+def write_idmt(root, names=IDMT_NAMES, test=IDMT_NAMES[2:], rate_hz=8000):
     (root / "annotation").mkdir(parents=True)
     lists = {"idmt_traffic_all": names, "eusipco_2021_test": test}
     lists["eusipco_2021_train"] = [name for name in names if name not in test]
     for name, lines in lists.items():
         (root / "annotation" / f"{name}.txt").write_text("".join(f"{line}.wav\n" for line in lines))
     for name in names:
-        write_sound(root / "audio" / f"{name}.wav")
+        write_sound(root / "audio" / f"{name}.wav", rate_hz=rate_hz)
     return root
 
 

@@ -7,6 +7,8 @@ data set in its own layout.
 import json
 import os
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +18,7 @@ from made_up_corner import write_corner
 from worldstate_lab.sequences.hearing import Chain, ovad_chain
 from worldstate_lab.sequences.recordings import TRUTH, read_recordings
 from worldstate_lab.sequences.tracking import NEAR_RAD, OC_SORT, WORLD, tracked, tracking_figures
-from worldstate_lab.trials.listening import LIKELY
+from worldstate_lab.trials.listening import likely_movers
 from worldstate_lab.trials.pass_cache import Hearer
 from worldstate_lab.trials.trial import find_takes
 
@@ -37,9 +39,8 @@ def believed_s(chain, recording):
     """Return the times at which vehicles are believed hidden and in view, in seconds."""
     found = {"hidden": [], "visible": [], "emerged": []}
     for step in chain.steps(recording):
-        for one in step.state.entities:
-            if one.moving and one.existence_probability >= LIKELY:
-                found[one.status].append(step.state.stamp_ns * 1e-9)
+        for one in likely_movers(step.state):
+            found[one.status].append(step.state.stamp_ns * 1e-9)
     return found
 
 
@@ -142,53 +143,40 @@ def real(request):
     return path, every, figures([tracked(path, one) for one in every if not one.hazard_free])
 
 
-# Lower limits that a defect would violate. The comments give the values on the 45 recordings: seven
-# microphones, two microphones.
+# Limits that a defect would violate. Comments give the values on the 45 recordings: seven microphones, two
+# microphones.
+LIMITS = [
+    ("identity/all/kept", 0.19, 1.0),  # 10 and 9 of 23; the lower ends of the intervals are 0.23 and 0.20
+    ("identity/all/no box", 0, 0),
+    ("hand_over/found", 0.85, 1.0),  # All, with a median of 0.0 s and a 90 % quantile of 0.1 s, on both paths
+    ("hand_over/median_s", 0.0, 0.15),
+    ("hand_over/late_s", 0.0, 0.35),
+    ("hand_over/right_side", 0.85, 1.0),  # All are right on both paths
+    ("before_t0/stated", 0.3, 1.0),  # 13 and 10 of 23 approaches
+    ("before_t0/time_error_s", 0.0, 1.5),  # 0.67 and 0.91 s
+    ("before_t0/time_coverage", 0.75, 1.0),  # 0.97 and 0.93 for a nominal 0.9
+    ("bearing/all/median_deg", 0.0, 15.0),  # 11.6 and 6.4 degrees
+    ("bearing/all/nees_mean", 0.0, 3.0),  # 1.3 and 0.5
+    (f"gospa_deg/all/{WORLD}/total", 0.0, 20.0),  # 13.8 and 14.1; OC-SORT 21.8
+]
 
 
 @pytest.mark.long
-def test_identity_is_kept_from_hidden_into_view(real):
-    found = real[2]["tracking"]["identity"]
-    # 10 and 9 of 23; the lower ends of the intervals are 0.23 and 0.20.
-    assert found["all"]["kept"] > 0.19
-    assert not found["all"]["no box"]
+@pytest.mark.parametrize(("path", "low", "high"), LIMITS)
+def test_figures_of_real_vehicles_are_within_their_limits(real, path, low, high):
+    assert low <= reduce(getitem, path.split("/"), real[2]["tracking"]) <= high
 
 
 @pytest.mark.long
-def test_vehicles_are_handed_over_at_once(real):
-    found = real[2]["tracking"]["hand_over"]
-    # All, with a median of 0.0 s and a 90 % quantile of 0.1 s, on both paths.
-    assert found["found"] > 0.85
-    assert found["median_s"] < 0.15 and found["late_s"] < 0.35
-
-
-@pytest.mark.long
-def test_the_side_of_a_vehicle_in_view_is_right(real):
-    assert real[2]["tracking"]["hand_over"]["right_side"] > 0.85  # All are right on both paths
-
-
-@pytest.mark.long
-def test_intervals_of_the_time_to_visible_are_calibrated(real):
-    found = real[2]["tracking"]["before_t0"]
-    assert found["stated"] > 0.3  # 13 and 10 of 23 approaches
-    assert found["time_error_s"] < 1.5  # Measured: 0.67 and 0.91 s
-    assert found["time_coverage"] > 0.75  # 0.97 and 0.93 for a nominal 0.9
-
-
-@pytest.mark.long
-def test_acoustic_bearings_in_view_are_near_moving_boxes(real):
-    found = real[2]["tracking"]["bearing"]["all"]
-    # 11.6 and 6.4 degrees; 3.3 with seven microphones against images 0.5 s later, because the rows of their
-    # spectra are early.
-    assert found["median_deg"] < 15.0
-    assert min(found["images_later_s"].values()) < 8.0
-    assert found["nees_mean"] < 3.0  # Measured: 1.3 and 0.5
+def test_acoustic_bearings_in_view_are_near_moving_boxes_at_some_delay(real):
+    # 3.3 degrees with seven microphones half a second later, because the rows of their spectra are early
+    assert min(real[2]["tracking"]["bearing"]["all"]["images_later_s"].values()) < 8.0
 
 
 @pytest.mark.long
 def test_tracks_beat_oc_sort_if_every_second_image_is_withheld(real):
     found = real[2]["tracking"]["gospa_deg"]["all"]
-    assert found[WORLD]["total"] < min(found[OC_SORT]["total"], 20.0)  # Measured: 13.8 and 14.1; OC-SORT 21.8
+    assert found[WORLD]["total"] < found[OC_SORT]["total"]
 
 
 @pytest.mark.long

@@ -88,10 +88,6 @@ class Awareness:
     hops_in_view: int  # Hops after T0 from which awareness is computed
     hazard_free_hours: float  # Hours from which false alarms are computed
 
-    def row(self, name: str) -> AwarenessRow:
-        """Return the row of a condition."""
-        return next(row for row in self.rows if row.condition.name == name)
-
 
 def hazard_awareness(
     recordings: Sequence[Staged],
@@ -202,9 +198,8 @@ def _row(state: Condition, judged: Sequence[_Judged], vision: Share, awareness: 
 
 def _common_cause(level: int, shares: Mapping[str, tuple[Share, Share]]) -> CommonCause:
     names = (CLEAN, *(Condition(family, level).name for family in (LENS, ROOF, RAIN)))
-    clean, lens, roof, rain = (
-        np.array([value, *drawn]) for _, (value, drawn) in map(shares.__getitem__, names)
-    )
+    aware = [shares[name][1] for name in names]
+    clean, lens, roof, rain = (np.array([value, *drawn]) for value, drawn in aware)
     additive = np.clip(lens + roof - clean, 0.0, 1.0)
     figures = (lens, roof, rain, additive, additive - rain)
     return CommonCause(level, RAIN_DB[level], *(_estimate(float(one[0]), one[1:]) for one in figures))

@@ -95,9 +95,7 @@ def by_condition(filtered: HopTable) -> dict[str, HopTable]:
     """Split the concatenated conditions of `filter_in_conditions`."""
     names = filtered.columns["condition"]
     first = np.sort(np.unique(names, return_index=True)[1])
-    parts = {
-        key: np.split(column, first[1:]) for key, column in filtered.columns.items() if key != "condition"
-    }
+    parts = {key: np.split(one, first[1:]) for key, one in filtered.columns.items() if key != "condition"}
     return {
         str(names[start]): replace(filtered, columns={key: split[i] for key, split in parts.items()})
         for i, start in enumerate(first)

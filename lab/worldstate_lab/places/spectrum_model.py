@@ -132,9 +132,7 @@ def _source_images(walls: StreetWalls, crossing_m: float) -> list[float]:
         return [crossing_m]
     mouth, depth = walls.corner_ahead_m, walls.facing_m - walls.corner_ahead_m
     inside = crossing_m - mouth
-    return [
-        mouth + 2.0 * depth * ((order + 1) // 2) + inside * (-1) ** order for order in range(FACADE_ORDER + 1)
-    ]
+    return [mouth + 2.0 * depth * ((k + 1) // 2) + inside * (-1) ** k for k in range(FACADE_ORDER + 1)]
 
 
 def _array_images(walls: StreetWalls) -> Iterator[tuple[float, int, tuple[int, int]]]:
@@ -329,15 +327,13 @@ def _draws(number: int) -> FloatArray:
     return np.asarray(LEAST + (MOST - LEAST) * np.mod(0.5 + np.arange(1, number + 1)[:, None] * _GOLDEN, 1.0))
 
 
-def _arriving(
-    walls: StreetWalls, along_m: FloatArray, frequencies_hz: FloatArray, draw: FloatArray
-) -> FloatArray:
+def _arriving(walls: StreetWalls, along_m: FloatArray, hz: FloatArray, draw: FloatArray) -> FloatArray:
     """Return the power from every position by azimuth of arrival, (N, F, azimuths of `_ARRIVALS_RAD`)."""
     left, right, facade, _, screen_db, off_m = draw.tolist()
-    arriving = np.zeros((len(along_m), len(frequencies_hz), len(_ARRIVALS_RAD)))
+    arriving = np.zeros((len(along_m), len(hz), len(_ARRIVALS_RAD)))
     every = np.arange(len(along_m))
     for part_m in PARTS_M:
-        for path in sound_paths(walls, walls.crossing_m + off_m, along_m + part_m, frequencies_hz):
+        for path in sound_paths(walls, walls.crossing_m + off_m, along_m + part_m, hz):
             # A path counts as diffracted if the corner removes more than half of its power.
             bent = np.where(path.passed < 1.0 / 3.0, 10.0 ** (screen_db / 10.0), 1.0)
             at = np.rint(np.degrees(path.azimuth_rad)).astype(int) + 90

@@ -9,7 +9,6 @@ import numpy as np
 from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.adapters.files.model_file import Model
 from worldstate.commissioning.heard_stream import HeardStream, junction_named
-from worldstate.commissioning.stream_exam import approaches
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import StreamApproach
@@ -193,13 +192,6 @@ def joined_encounters(parts: Sequence[Encounters]) -> Encounters:
     """Return the encounters of several streams."""
     names = [one.name for one in fields(Encounters)]
     return Encounters(**{name: np.concatenate([getattr(one, name) for one in parts]) for name in names})
-
-
-def recorded_approaches(
-    streams: Sequence[BelievedStream], *, quiet: bool
-) -> list[tuple[BelievedStream, StreamApproach]]:
-    """Return all approaches with loud vehicles only, or those with at least one quiet vehicle."""
-    return [(stream, one) for stream in streams for one in approaches(stream.heard) if one.quiet is quiet]
 
 
 def approach_encounters(

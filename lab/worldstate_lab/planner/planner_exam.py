@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
+from worldstate.commissioning.stream_exam import approaches
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.figure_style import CATEGORIES, TRUTH, figure_file
 from worldstate.operations.metrics.approach_table import share_interval
@@ -24,7 +25,6 @@ from .encounters import (
     Encounters,
     approach_encounters,
     empty_encounters,
-    recorded_approaches,
 )
 
 HORIZON_S = 3.0
@@ -51,9 +51,7 @@ class Drives:
         return np.where(self.needed, 0.0, self.braking_s)
 
 
-def drive_through(
-    encounters: Encounters, threshold: float, ego: EgoVehicle, *, remembers: bool = False
-) -> Drives:
+def drive_through(met: Encounters, threshold: float, ego: EgoVehicle, *, remembers: bool = False) -> Drives:
     """Drive through all encounters, braking for visible and for assumed vehicles.
 
     A vehicle at the speed limit is assumed just beyond the visible part of a side if the chance that a
@@ -61,28 +59,28 @@ def drive_through(
     is always assumed, with infinity never. With memory, the assumed vehicle is no nearer than a vehicle that
     was never in sight can be.
     """
-    assumed = encounters.within[..., HORIZONS_S.index(HORIZON_S)] >= threshold
-    n = len(encounters)
-    x, v = encounters.line_m - ego.begins_m, np.full(n, ego.begins_mps)
-    end_m = encounters.lane_m.max(axis=1) + HALF_LANE_M + ego.length_m
+    assumed = met.within[..., HORIZONS_S.index(HORIZON_S)] >= threshold
+    n = len(met)
+    x, v = met.line_m - ego.begins_m, np.full(n, ego.begins_mps)
+    end_m = met.lane_m.max(axis=1) + HALF_LANE_M + ego.length_m
     collided, braking, hardest, took = np.zeros(n, bool), np.zeros(n), np.zeros(n), np.full(n, np.nan)
-    first_seen = np.full(encounters.side.shape, STEPS * 2)
+    first_seen = np.full(met.side.shape, STEPS * 2)
     late = round(ego.reaction_s / STEP_S)
     fronts, reach = np.empty((n, STEPS)), np.zeros((n, 2))
     for step in range(STEPS):
         fronts[:, step] = x
-        sight = sight_m(encounters, x - ego.eye_m)
-        mine = np.take_along_axis(sight, encounters.side, axis=1)
-        to_come = encounters.to_come_m[:, step]
-        visible = ((to_come <= mine) | encounters.in_view[:, step]) & (to_come > -_FAR_M)
+        sight = sight_m(met, x - ego.eye_m)
+        mine = np.take_along_axis(sight, met.side, axis=1)
+        to_come = met.to_come_m[:, step]
+        visible = ((to_come <= mine) | met.in_view[:, step]) & (to_come > -_FAR_M)
         first_seen = np.minimum(first_seen, np.where(visible, step, STEPS * 2))
         hop = max(step - late, 0) // HOP_STEPS
         free = np.minimum(ego.acceleration_mps2, (ego.limit_mps - v) / STEP_S)
         # A view that has just opened is used only after the reaction time.
-        then = sight_m(encounters, fronts[:, max(step - late, 0)] - ego.eye_m)
+        then = sight_m(met, fronts[:, max(step - late, 0)] - ego.eye_m)
         reach = unseen_from_m(reach, then, ego.limit_mps * STEP_S) if remembers else then
-        for_hidden = _for_assumed(encounters, ego, x, v, reach, assumed[:, hop])
-        for_seen = _for_seen(encounters, ego, x, v, step, step - first_seen >= late)
+        for_hidden = _for_assumed(met, ego, x, v, reach, assumed[:, hop])
+        for_seen = _for_seen(met, ego, x, v, step, step - first_seen >= late)
         chosen = np.clip(np.minimum(np.minimum(for_hidden, for_seen), free), -ego.full_mps2, None)
         chosen = np.maximum(chosen, -v / STEP_S)
         driving = np.isnan(took) & ~collided
@@ -93,9 +91,9 @@ def drive_through(
         hardest = np.where(driving, np.maximum(hardest, -chosen), hardest)
         x = np.where(driving, x + v * STEP_S + 0.5 * chosen * STEP_S**2, x)
         v = np.where(driving, np.maximum(v + chosen * STEP_S, 0.0), v)
-        collided |= driving & _overlaps(encounters, ego, x, min(step + 1, STEPS - 1))
+        collided |= driving & _overlaps(met, ego, x, min(step + 1, STEPS - 1))
         took = np.where(driving & (x >= end_m), (step + 1) * STEP_S, took)
-    return Drives(collided, braking, hardest, took, _needed(encounters, ego), fronts)
+    return Drives(collided, braking, hardest, took, _needed(met, ego), fronts)
 
 
 def sight_m(encounters: Encounters, eye_m: FloatArray) -> FloatArray:
@@ -226,7 +224,8 @@ def approaches_drawn(
     streams: Sequence[BelievedStream], count: int, ego: EgoVehicle, rng: np.random.Generator
 ) -> tuple[Encounters, Encounters]:
     """Draw this many approaches of loud vehicles, and quiet ones in proportion to their share."""
-    loud, quiet = (recorded_approaches(streams, quiet=kind) for kind in (False, True))
+    every = [(stream, one) for stream in streams for one in approaches(stream.heard)]
+    loud, quiet = ([pair for pair in every if pair[1].quiet is kind] for kind in (False, True))
     quiet_count = max(round(count * len(quiet) / max(len(loud), 1)), 1)
     return approach_encounters(loud, count, ego, rng), approach_encounters(quiet, quiet_count, ego, rng)
 
@@ -243,9 +242,7 @@ def safe_threshold(approached: Sequence[Encounters], ego: EgoVehicle) -> float:
     return kept
 
 
-def drives_of(
-    corners: Corners, threshold: float, ego: EgoVehicle, *, remembers: bool = False
-) -> CornerDrives:
+def drives_of(corners: Corners, threshold: float, ego: EgoVehicle, remembers: bool = False) -> CornerDrives:
     """Return the drives of the planner that assumes a vehicle if its chance is above a threshold."""
     return CornerDrives(*(drive_through(one, threshold, ego, remembers=remembers) for one in corners))
 

@@ -31,9 +31,8 @@ from .recordings import CornerRecording
 
 # Miss rate of a fully trusted camera; at a rate of zero the logarithm would be infinite.
 _NEVER = 1e-6
-TRUSTED = MissRates(
-    (0.0, 90.0), {"trusted": FamilyCounts(((1e9,) * 5,), ((0.0,) * 5,), (1e3,) * 5, (0.0,) * 5)}
-)
+_NO_MISS = FamilyCounts(((1e9,) * 5,), ((0.0,) * 5,), (1e3,) * 5, (0.0,) * 5)
+TRUSTED = MissRates((0.0, 90.0), {"trusted": _NO_MISS})
 
 
 def corner_rows(
@@ -136,14 +135,12 @@ def product_row(streams: Sequence[HopTable], rng: np.random.Generator, alpha: fl
     }
 
 
-def _aware_of(
-    approaches: Sequence[HopTable], aware: Mapping[str, BoolArray], rng: np.random.Generator
-) -> Figures:
-    """Return the share of aware hops with the vehicle in view, with its interval over approaches."""
-    in_view = [one.after_sight() for one in approaches]
-    hits = np.array([aware[one.name][seen].sum() for one, seen in zip(approaches, in_view, strict=True)])
+def _aware_of(some: Sequence[HopTable], aware: Mapping[str, BoolArray], rng: np.random.Generator) -> Figures:
+    """Return the share of aware hops with the vehicle in view, with its interval over some."""
+    in_view = [one.after_sight() for one in some]
+    hits = np.array([aware[one.name][seen].sum() for one, seen in zip(some, in_view, strict=True)])
     hops = np.array([seen.sum() for seen in in_view])
-    draws = stratified_draws([str(one.about["site"]) for one in approaches], rng)
+    draws = stratified_draws([str(one.about["site"]) for one in some], rng)
     share, drawn = pooled_share(hits, hops, draws)
     return {"aware": share, "aware_low": middle(drawn)[0], "aware_high": middle(drawn)[1]}
 

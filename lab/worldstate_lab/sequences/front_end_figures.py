@@ -6,11 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.frontend.approach.doppler import radial_speed
-from worldstate.frontend.approach.engine_line import track_fundamental
-from worldstate.ground.values import NotUsable
 from worldstate_lab.evaluation.front_end_study import front_end_study
-from worldstate_lab.trials.listening import LEAST_PARTIALS, pass_time_s
+from worldstate_lab.trials.listening import pass_time_s, tone_refusal
 from worldstate_lab.trials.trial import Trial
 
 from .recordings import CornerRecording
@@ -50,12 +47,6 @@ def _with_pass(trial: Trial, recording: CornerRecording) -> Trial:
     """Add the time of the pass, the reason if its tone cannot be used, and missing MUSIC bearings."""
     about = {**trial.hops.about, "pass_s": None, "doppler": "no vehicle"}
     if not trial.hazard_free:
-        about |= {"pass_s": pass_time_s(trial.truth), "doppler": _doppler(recording)}
+        samples, rate_hz = recording.samples()
+        about |= {"pass_s": pass_time_s(trial.truth), "doppler": tone_refusal(samples[:, 0], rate_hz)}
     return replace(trial, hops=trial.hops.replace(music_rad=np.full(len(trial.hops), np.nan), about=about))
-
-
-def _doppler(recording: CornerRecording) -> str:
-    samples, rate_hz = recording.samples()
-    track = track_fundamental(np.ascontiguousarray(samples[:, 0]), rate_hz)
-    found = radial_speed(track, min_partials=LEAST_PARTIALS)
-    return found.reason if isinstance(found, NotUsable) else ""

@@ -28,8 +28,8 @@ from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.state import RiskCue, WorldState
 from worldstate_lab.trials.listening import (
     box_table,
+    columns_of,
     filtered_decisions,
-    hop_columns,
     tables_of_steps,
     unfiltered_decisions,
     widest_moving,
@@ -151,7 +151,7 @@ def heard(chain: Chain, recording: CornerRecording) -> Trial:
     t0_s = np.nan if recording.hazard_free else recording.t0_s
     hops = HopTable(
         {
-            **hop_columns(said["stream"], frames, vision),
+            **columns_of(said["stream"], frames, vision),
             **product,
             "bearing_std_rad": np.array([frame.bearing_std_rad for frame in frames]),
         },

@@ -120,23 +120,13 @@ class HopScore:
     of: BySide  # shape (n,) or (n, 2)
     sides: BySide | None = None  # shape (n, 2): Values that give the side if the score itself has no sides
 
-    def trials(self, path: Heard) -> Sequence[Trial]:
-        """Return the trials from which the score is computed."""
-        return path.seen if self.seen else path.alone
-
-    def scores(self, path: Heard) -> list[FloatArray]:
-        """Return the score of each trial, shape (n,)."""
-        found = map(self.of, self.trials(path))
-        return [one if one.ndim == 1 else one.max(axis=1) for one in found]
-
-    def right(self, path: Heard) -> list[FloatArray] | None:
-        """Return the score of right minus left, shape (n,) per trial; None without sides."""
-        found = [(self.sides or self.of)(one) for one in self.trials(path)]
-        return None if found[0].ndim == 1 else [one[:, 1] - one[:, 0] for one in found]
-
     def figures(self, path: Heard, rng: np.random.Generator) -> dict[str, Any]:
-        """Return the figures of the score."""
-        return score_figures(self.trials(path), self.scores(path), self.right(path), rng)
+        """Return the figures of the score, and of right minus left if it has sides."""
+        trials = path.seen if self.seen else path.alone
+        found, sides = (list(map(of, trials)) for of in (self.of, self.sides or self.of))
+        right = None if sides[0].ndim == 1 else [one[:, 1] - one[:, 0] for one in sides]
+        scores = [one if one.ndim == 1 else one.max(axis=1) for one in found]
+        return score_figures(trials, scores, right, rng)
 
 
 def score_figures(
@@ -190,11 +180,8 @@ def _decision(trial: Trial) -> FloatArray:
 
 
 _risk, _compared = attrgetter("hops.risk"), attrgetter("hops.compared_nats")
-PRODUCT, DECISION, DECISION_SEEN = (
-    "product, with camera",
-    "decision value, sound alone",
-    "decision value, with camera",
-)
+PRODUCT = "product, with camera"
+DECISION, DECISION_SEEN = "decision value, sound alone", "decision value, with camera"
 SCORES = (
     HopScore("window alone", False, _window, _ratios),
     HopScore("window and absence", True, _unseen, _ratios),

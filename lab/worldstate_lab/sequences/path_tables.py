@@ -50,9 +50,7 @@ def _lead_row(name: str, row: Row, exam: Mapping[str, Any] | None) -> tuple[Cell
     return name, *areas, *sites, f"{row['approaches']} + {row['hazard_free']}", *simulated
 
 
-def alarm_table(
-    rows: Mapping[str, Row], head: str, title: str, exam: Mapping[str, Any] | None = None
-) -> Table:
+def alarm_table(rows: Mapping[str, Row], head: str, title: str, exam: Row | None = None) -> Table:
     """Return a table of alarms, one per row, with the figures of a model's simulated exam."""
     cells = [(name, *_alarm_row(row)) for name, row in rows.items()]
     if exam is not None:
@@ -79,12 +77,8 @@ def _alarm_row(row: Row) -> tuple[Cell, ...]:
 
 def scores_table(scores: Mapping[str, Any], title: str) -> Table:
     """Return a table of scores: AUROC before T0, and the warnings at their best thresholds."""
-    heads = (
-        "score",
-        *(f"{one} s" for one in _SHOWN_LEADS),
-        *(f"side {one} s" for one in _SHOWN_SIDES),
-        *(f"onsets <= {one}" for one in _SHOWN_ONSETS),
-    )
+    areas = (*(f"{one} s" for one in _SHOWN_LEADS), *(f"side {one} s" for one in _SHOWN_SIDES))
+    heads = ("score", *areas, *(f"onsets <= {one}" for one in _SHOWN_ONSETS))
     return Table("scores", title, heads, [(name, *_score_row(one)) for name, one in scores.items()])
 
 
@@ -107,18 +101,15 @@ def _sentences(found: Mapping[str, Any]) -> list[str]:
             lines.append(f"windows, {name}: {', '.join(parts)}")
     for name, key in (("with the camera", "calibration"), ("sound alone", "calibration_sound_alone")):
         some = found[key]
-        parts = [
-            f"{one} {_spread(some, one).text}" for one in ("ece", "brier_skill") if some[one] is not None
-        ]
-        lines.append(
-            f"in view within 2 s, {name}: {', '.join(parts)}, base rate {_value(some['base_rate']).text}"
-        )
+        known = (one for one in ("ece", "brier_skill") if some[one] is not None)
+        parts = [*(f"{one} {_spread(some, one).text}" for one in known)]
+        parts.append(f"base rate {_value(some['base_rate']).text}")
+        lines.append(f"in view within 2 s, {name}: {', '.join(parts)}")
     lines.append(", ".join(f"{name} {_value(found[name]).text}" for name in FOLLOWED))
     for name, some in found.get("front_end", {}).items():
         if isinstance(some, dict) and "value" in some:
-            lines.append(
-                f"front-end, {name}: {Value(some['value'], *some['interval']).text}, paper {some['paper']:g}"
-            )
+            value = Value(some["value"], *some["interval"]).text
+            lines.append(f"front-end, {name}: {value}, paper {some['paper']:g}")
     if "exam" in found:
         parts = [f"{name} {_value(value, 3).text}" for name, value in found["exam"].items()]
         lines.append(f"simulated exam: {', '.join(parts)}")

@@ -104,7 +104,9 @@ class CornerRecording:
     def boxes(self, folder: str | Path = "boxes") -> DetectionLog:
         """Read the boxes of every image, except those of vehicles parked throughout the recording."""
         log = without_standing(read_boxes(self.folder / folder / f"{self.name}.json"))
-        return log if not self.start_s else _from(log.shifted(-self.start_s))
+        log = log.shifted(-self.start_s)
+        first = int(np.searchsorted(log.stamps_ns, 0))
+        return DetectionLog(log.frames[first:], log.stamps_ns[first:], log.source)
 
 
 def seven_microphones() -> MicrophoneArray:
@@ -196,12 +198,6 @@ def without_standing(log: DetectionLog) -> DetectionLog:
     kept = dict(zip(np.unique(image).tolist(), moving, strict=True))
     frames = [only(one, np.flatnonzero(kept[at])) if at in kept else one for at, one in enumerate(log.frames)]
     return DetectionLog(tuple(frames), log.stamps_ns, log.source)
-
-
-def _from(log: DetectionLog) -> DetectionLog:
-    """Return the images of a log from time zero on."""
-    first = int(np.searchsorted(log.stamps_ns, 0))
-    return DetectionLog(log.frames[first:], log.stamps_ns[first:], log.source)
 
 
 def only(frame: DetectionFrame, kept: IndexArray) -> DetectionFrame:

@@ -109,9 +109,7 @@ def _lead(
     hops, free = [hop_before(one, lead_s) for one in trials], np.array([one.hazard_free for one in trials])
     sites = np.array([one.site for one in trials])
     chosen = [score[hop] for score, hop in zip(scores, hops, strict=True)]
-    every = [
-        score if one.hazard_free else part for one, score, part in zip(trials, scores, chosen, strict=True)
-    ]
+    every = [score if one.hazard_free else at for one, score, at in zip(trials, scores, chosen, strict=True)]
     there = np.array([hop.size for hop in hops])
     by_site = {site: areas(chosen, ~free, weights * (sites == site)) for site in np.unique(sites).tolist()}
     whole = {"auroc": areas(chosen, ~free, weights), "auroc_all_hops": areas(every, ~free, weights)}

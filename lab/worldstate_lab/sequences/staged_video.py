@@ -7,7 +7,7 @@ existing files are not computed again. An image is null if it was not searched a
 import importlib.util
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -114,24 +114,22 @@ def stage_recording(staging: Staging, recording: CornerRecording) -> int:
             small = _small(image)
             reduced = image.shape[1] / small.shape[1]
             for state, detector, into in zip(states, detectors, rows, strict=True):
-                searched = at % staging.every == 0
-                rng = _generator(staging.seed, recording.name, state, at)
-                found = detector.detect(state.stage(small, rng, reduced)) if searched else None
-                into.append(None if found is None else _boxes(found, reduced))
+                if at % staging.every:
+                    into.append(None)
+                    continue
+                # The staging depends on no other image and on no detector.
+                mark = zlib.crc32(f"{recording.name} {state.name}".encode())
+                rng = np.random.default_rng([staging.seed, mark, at])
+                into.append(_boxes(detector.detect(state.stage(small, rng, reduced)), reduced))
+    about = {"size": (video.width_px, video.height_px), "fps": round(video.frame_rate_hz, 3)}
     for state, into in zip(states, rows, strict=True):
-        _write(
-            staging.path(state, recording.name), into, (video.width_px, video.height_px), video.frame_rate_hz
-        )
+        staging.folder(state).mkdir(parents=True, exist_ok=True)
+        write_json(staging.path(state, recording.name), {"frames": into, **about})
     return sum(row is not None for into in rows for row in into)
 
 
 def _small(image: ImageArray) -> ImageArray:
     return reduced_to(image[_LEFT_OUT_ROWS:-_LEFT_OUT_ROWS], WIDTH_PX)
-
-
-def _generator(seed: int, name: str, state: Condition, image: int) -> np.random.Generator:
-    """Return the generator of one image: the staging depends on no other image and on no detector."""
-    return np.random.default_rng([seed, zlib.crc32(f"{name} {state.name}".encode()), image])
 
 
 def _boxes(found: DetectionFrame, reduced: float) -> list[list[Any]]:
@@ -140,11 +138,6 @@ def _boxes(found: DetectionFrame, reduced: float) -> list[list[Any]]:
     edges = np.round(boxes, 1).tolist()
     scores = np.round(found.scores, 3).tolist()
     return [[*box, score, label] for box, score, label in zip(edges, scores, found.labels, strict=True)]
-
-
-def _write(path: Path, frames: Sequence[Any], size: tuple[int, int], rate_hz: float) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, {"frames": frames, "size": size, "fps": round(rate_hz, 3)})
 
 
 def milliseconds_a_search(staging: Staging, recording: CornerRecording) -> float:

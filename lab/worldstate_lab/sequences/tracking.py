@@ -16,7 +16,7 @@ from worldstate.adapters.camera.box_linking import AzimuthBox, linked_boxes
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.listener import Step
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.ground.values import nanoseconds, seconds, wrap_angle
 from worldstate.measurement.measurement import Bearing
 from worldstate.operations.labelling.pass_labels import LONGEST_GAP_S
@@ -26,7 +26,7 @@ from worldstate.state import Entity, WorldState
 from worldstate_lab.methods.oc_sort import OcSort
 from worldstate_lab.metrics.intervals import middle, pooled_draws
 from worldstate_lab.metrics.track_measures import gated_median_deg, gospa_bearing
-from worldstate_lab.trials.listening import LIKELY, box_table, frame_row, reference_rad
+from worldstate_lab.trials.listening import box_table, frame_row, likely_movers, reference_rad
 
 from .hearing import Chain
 from .recordings import CornerRecording
@@ -116,8 +116,7 @@ def _vehicle(boxes: HopTable, recording: CornerRecording) -> list[AzimuthBox]:
 
 
 def _there(state: WorldState, status: str) -> list[Entity]:
-    likely = (one for one in state.entities if one.moving and one.existence_probability >= LIKELY)
-    return [one for one in likely if one.status == status]
+    return [one for one in likely_movers(state) if one.status == status]
 
 
 def _standing_for(state: WorldState, box: AzimuthBox) -> Entity | None:
@@ -162,14 +161,12 @@ def _bearings(steps: Iterable[Step], vision: VisionQuery, t0_s: float) -> HopTab
     return table.replace(error_rad=table.error_rad.reshape(-1, len(SHIFTS_S)))
 
 
-def _costs(
-    chain: Chain, recording: CornerRecording, boxes: HopTable, min_score: float
-) -> dict[str, FloatArray]:
+def _costs(chain: Chain, recording: CornerRecording, boxes: HopTable, score: float) -> dict[str, FloatArray]:
     """Return the GOSPA of every method's tracks in the withheld images."""
     steps = _by_image(replace(chain, image_step=2), recording)
     log, rows = chain.source(recording).detections, {WORLD: list[FloatArray](), OC_SORT: list[FloatArray]()}
     assert log is not None
-    tracks = _oc_sort(boxes, min_score, len(log))
+    tracks = _oc_sort(boxes, score, len(log))
     for image, stamp_ns in list(enumerate(log.stamps_ns.tolist()))[1::2]:
         step, truth = steps.get(_number(seconds(stamp_ns))), boxes.azimuth_rad[_moving_in(boxes, image)]
         # Entities that left the view are kept for some seconds, but the camera is not queried for them.
@@ -292,22 +289,17 @@ def _bearing_row(some: Sequence[Tracked], rng: np.random.Generator) -> Row:
     hops = joined(every)
     surest = HopTable({"error_rad": hops.error_rad[:, _NOW], "prominence": hops.prominence})
     later = zip(SHIFTS_S, np.degrees(np.abs(hops.error_rad)).T, strict=True)
+    known = [(f"{shift_s:g}", errors[np.isfinite(errors)]) for shift_s, errors in later]
     return {
         **_errors(some, every, rng),
-        "usable": _errors(some, [_only_usable(one) for one in every], rng),
+        "usable": _errors(some, [_only(one, one.usable) for one in every], rng),
         "surest_deg": gated_median_deg(surest) if len(hops) else None,
-        "images_later_s": {f"{shift_s:g}": _known_median(errors) for shift_s, errors in later},
+        "images_later_s": {shift: float(np.median(one)) if one.size else None for shift, one in known},
     }
 
 
-def _known_median(values: FloatArray) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else None
-
-
-def _only_usable(bearings: HopTable) -> HopTable:
-    kept = bearings.usable.astype(bool)
-    return HopTable({name: column[kept] for name, column in bearings.columns.items()})
+def _only(bearings: HopTable, kept: AnyArray) -> HopTable:
+    return HopTable({name: column[kept.astype(bool)] for name, column in bearings.columns.items()})
 
 
 def _errors(some: Sequence[Tracked], bearings: Sequence[HopTable], rng: np.random.Generator) -> Row:

@@ -123,15 +123,13 @@ def interval(figure: Callable[[ClipScores], float], scores: ClipScores, rng: np.
     return middle(np.array([figure(scores.select(some)) for some in drawn]))
 
 
-def draw_recordings(
-    recordings: TextArray, vehicle: BoolArray, rng: np.random.Generator
-) -> Iterator[IndexArray]:
+def draw_recordings(names: TextArray, vehicle: BoolArray, rng: np.random.Generator) -> Iterator[IndexArray]:
     """Return the rows of draws of recordings with replacement.
 
-    Shapes: recordings, vehicle (n,).
+    Shapes: names, vehicle (n,).
     """
-    names, of_clip = np.unique(recordings, return_inverse=True)
-    rows = [np.flatnonzero(of_clip == i) for i in range(len(names))]
+    every, of_clip = np.unique(names, return_inverse=True)
+    rows = [np.flatnonzero(of_clip == i) for i in range(len(every))]
     # Stratified by the classes that a recording contains; otherwise a draw could lack the background.
     holds = [(bool(vehicle[one].any()), bool(vehicle[one].all())) for one in rows]
     return pooled_draws(rows, holds, rng)

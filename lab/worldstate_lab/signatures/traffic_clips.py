@@ -104,9 +104,7 @@ def idmt_traffic(root: str | Path) -> list[TrafficClip]:
     there = {path.name for path in (folder / "audio").glob("*.wav")}
     missing = [f"audio/{name}" for name in names if name not in there]
     _refuse_missing(folder, f"the {len(names)} clips of annotation/{ALL_NAME}", missing)
-    splits = {
-        name: part for part, file in SPLIT_NAMES.items() for name in _names(folder / "annotation" / file)
-    }
+    splits = {one: part for part, file in SPLIT_NAMES.items() for one in _names(folder / "annotation" / file)}
     return [
         TrafficClip(folder / "audio" / name, _idmt_labels(folder, name, splits.get(name, "")))
         for name in names

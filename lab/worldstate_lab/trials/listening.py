@@ -31,10 +31,10 @@ from worldstate.frontend.settings import BEARING_HOPS, HOP_RATE_HZ, FrontEndSett
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.errors import OutOfDomainError
-from worldstate.ground.typing import AnyArray, BoolArray, FloatArray
+from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray
 from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream
-from worldstate.state import RiskCue, WorldState
+from worldstate.state import Entity, RiskCue, WorldState
 from worldstate_lab.metrics.stream_statistic import stream_statistic
 
 from .trial import (
@@ -87,10 +87,10 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     truth = _truth(take, boxes)
     pairs = list(measure_steps(replace(source, model=_Silent())))
     frames = [frame for frame, _ in pairs]
-    columns = hop_columns(hop_stream((m for _, m in pairs), name=take.name), frames, vision)
+    columns = columns_of(hop_stream((m for _, m in pairs), name=take.name), frames, vision)
     with open_audio(source.audio_path, strict=False) as audio:
         columns["music_rad"] = _music(audio, source.array, frames, np.isfinite(columns["reference_rad"]))
-        doppler = "no vehicle" if take.t0_s is None else _doppler(audio, source.array, take.t0_s)
+        doppler = "no vehicle" if take.t0_s is None else _tone_of_pass(audio, source.array, take.t0_s)
     about = {
         "site": take.site,
         "moving": take.moving,
@@ -103,9 +103,7 @@ def front_end_tables(take: Take) -> dict[str, HopTable]:
     return {"hops": hops, "boxes": boxes, "truth": truth}
 
 
-def hop_columns(
-    stream: HopTable, frames: Sequence[AcousticFrame], vision: VisionQuery
-) -> dict[str, AnyArray]:
+def columns_of(stream: HopTable, frames: Sequence[AcousticFrame], vision: VisionQuery) -> dict[str, AnyArray]:
     """Return the columns of a trial that need no model, from a hop stream, its frames and moving boxes."""
     measured = ("time_s", "answer", "miss_rate", "clutter_rate", "approach", "seen")
     named = ("features", "prominence", "log_slope_hz", "bearing_rad")
@@ -153,10 +151,9 @@ def tables_of_steps(name: str, steps: Iterable[Step]) -> dict[str, HopTable]:
         measured.append(step.measurement)
         grounded.append([_grounded(step, grounding) for grounding in (Grounding(), RATELESS)])
         rows.append(_decided(step.state))
-        for entity in step.state.entities:
-            if entity.moving and entity.existence_probability >= LIKELY:
-                number = identities.setdefault(entity.id, len(identities))
-                tracks.append((step.state.time_s, number, entity.azimuth_rad))
+        for entity in likely_movers(step.state):
+            number = identities.setdefault(entity.id, len(identities))
+            tracks.append((step.state.time_s, number, entity.azimuth_rad))
     stream = hop_stream(measured, name=name)
     return {
         "decisions": HopTable.of_rows(DECISION_COLUMNS, rows),
@@ -236,9 +233,13 @@ def _bearing(state: WorldState) -> float:
     """Return the azimuth of the moving entity with the highest existence probability, NaN if none exists."""
     # The azimuth of a cue is not used: with a vehicle in view, both hidden sides have a negligible risk, at
     # 55 degrees.
-    likely = [one for one in state.entities if one.moving and one.existence_probability >= LIKELY]
-    strongest = max(likely, key=lambda one: one.existence_probability, default=None)
+    strongest = max(likely_movers(state), key=lambda one: one.existence_probability, default=None)
     return np.nan if strongest is None else strongest.azimuth_rad
+
+
+def likely_movers(state: WorldState) -> list[Entity]:
+    """Return the moving entities that probably exist."""
+    return [one for one in state.entities if one.moving and one.existence_probability >= LIKELY]
 
 
 def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
@@ -296,13 +297,18 @@ def reference_rad(frame: AcousticFrame, vision: VisionQuery) -> float:
     return min(moving, key=lambda azimuth: abs(azimuth - frame.bearing_rad), default=np.nan)
 
 
-def _doppler(audio: AudioSource, array: MicrophoneArray, t0_s: float) -> str:
+def _tone_of_pass(audio: AudioSource, array: MicrophoneArray, t0_s: float) -> str:
     """Return why the tone of the pass-by cannot be used at the microphone nearest to the centre, or ""."""
     middle = int(np.argmin(np.linalg.norm(array.centred_m, axis=1)))
     rate = audio.sample_rate_hz
     first = round(max(t0_s - AROUND_S, 0.0) * rate)
     count = min(round(2.0 * AROUND_S * rate), audio.frames - first)
-    track = track_fundamental(np.ascontiguousarray(audio.span(first, count)[:, middle]), rate)
+    return tone_refusal(audio.span(first, count)[:, middle], rate)
+
+
+def tone_refusal(samples: Float32Array, rate_hz: float) -> str:
+    """Return why the tone of a pass-by cannot be used, or ""."""
+    track = track_fundamental(np.ascontiguousarray(samples), rate_hz)
     found = radial_speed(track, min_partials=LEAST_PARTIALS)
     return found.reason if isinstance(found, NotUsable) else ""
 

@@ -79,10 +79,8 @@ class Decisions:
         n = len(time_s)
         unknown = dict.fromkeys(("bearing_rad", "score", "risk"), np.full(n, np.nan))
         columns = {"side": np.zeros(n, np.int64), "visible_s": np.full((n, 3), np.nan), **unknown}
-        tracks = HopTable.of_rows(TRACK_COLUMNS, ())
-        return cls(
-            **{"time_s": time_s, "alarm": np.asarray(alarm, bool), "tracks": tracks, **columns, **stated}
-        )
+        given = {"time_s": time_s, "alarm": np.asarray(alarm, bool), **columns, **stated}
+        return cls(**{"tracks": HopTable.of_rows(TRACK_COLUMNS, ()), **given})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,12 +202,10 @@ class Take:
     moving: bool = False  # Whether the ego moves
 
     @classmethod
-    def of(cls, recording: Recording) -> "Take":
+    def of(cls, one: Recording) -> "Take":
         """Return the take of a recording in a data set."""
-        label, site = recording.label or "none", recording.environment or "?"
-        return cls(
-            recording.path, recording.recording_id, site, label, recording.t0_s, bool(recording.moving_ego)
-        )
+        label, site = one.label or "none", one.environment or "?"
+        return cls(one.path, one.recording_id, site, label, one.t0_s, bool(one.moving_ego))
 
     @property
     def hazard_free(self) -> bool:
