@@ -447,7 +447,7 @@ class JointBelief:
     @property
     def in_view(self) -> float:
         """P(anything is in view)."""
-        return float(np.add.reduce(self.by_part[..., 1], None))
+        return min(float(np.add.reduce(self.by_part[..., 1], None)), 1.0)
 
     @cached_property
     def explanations(self) -> tuple[float, float, float]:

@@ -131,10 +131,6 @@ class Tracks:
             columns["place"][row] = self.place(row)
         return tuple(starmap(Track, zip(*[columns[name] for name in Track.__slots__], strict=True)))
 
-    def row(self, number: int) -> Track:
-        """Return a single entity."""
-        return self.taken([number]).rows()[0]
-
     def taken(self, where: IntArray | BoolArray | list[int]) -> "Tracks":
         """Return the columns of some entities."""
         return Tracks(*[column[where] for column in vars(self).values()])

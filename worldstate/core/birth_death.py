@@ -80,7 +80,7 @@ def view_heard(memory: Memory, site: SiteGeometry) -> None:
 
 def _unseen(memory: Memory, site: SiteGeometry) -> SideBelief:
     """Return the belief over the sides without vehicles that have just come into view and have tracks."""
-    sides, found = memory.sides, memory.belief.emerged_since(memory.stamp_ns, site.street.beside_s)
+    sides, found = memory.belief.sides, memory.belief.emerged_since(memory.stamp_ns, site.street.beside_s)
     emerged = tuple([0.0 if own else one for own, one in zip(found, sides.emerged, strict=True)])
     return replaced(sides, emerged=emerged)
 
@@ -108,18 +108,18 @@ def _ends(memory: Memory, row: int, alarmed: Sequence[bool], site: SiteGeometry)
 
 def _side_of_birth(memory: Memory, alarmed: Sequence[bool], site: SiteGeometry) -> int | None:
     """Return the side on which a hidden entity is born, or None; a single vehicle gets the likelier side."""
-    tracks, sides, least, every = memory.tracks, memory.sides, site.street.birth, range(len(site.sides))
-    heard = _heard_rows(tracks)
+    tracks, belief, least = memory.tracks, memory.belief, site.street.birth
+    heard, sides, every = _heard_rows(tracks), belief.sides, range(len(site.sides))
     # After a vehicle has come into view, the window still contains its earlier sound.
-    masked = memory.belief.emerged_since(memory.stamp_ns, site.street.masked_s)
+    masked = belief.emerged_since(memory.stamp_ns, site.street.masked_s)
     taken = {int(tracks.side[i]) for i in hidden_rows(tracks)}
     if heard and (len(heard) > 1 or sides.both < least):
         return None
     if not taken and not any(masked) and (sides.hidden_on(None) >= least or any(alarmed)):
         return max(every, key=sides.hidden_on)
     # If no sensor looks, a vehicle may be in view by its sound alone.
-    if not heard and not any(masked) and max(memory.belief.shown) >= least:
-        return max(every, key=memory.belief.shown.__getitem__)
+    if not heard and not any(masked) and max(belief.shown) >= least:
+        return max(every, key=belief.shown.__getitem__)
     free = [k for k in every if not masked[k] and k not in taken and (sides.hidden[k] >= least or alarmed[k])]
     return max(free, key=sides.hidden_on, default=None)
 
@@ -130,7 +130,7 @@ def merge_tracks(memory: Memory, site: SiteGeometry) -> tuple[Event, ...]:
     least = site.street.birth * min((tracks.existence[i] for i in heard), default=0.0)
     # If P(both) is lower, the second vehicle would be too unlikely to be born, given the less likely of the
     # two.
-    if len(heard) < 2 or memory.sides.both >= least:
+    if len(heard) < 2 or memory.belief.sides.both >= least:
         return ()
     age = [(-tracks.existence[i], tracks.created_ns[i], tracks.id[i]) for i in heard]
     first, second, *_ = (heard[k] for k in sorted(range(len(heard)), key=age.__getitem__))

@@ -10,7 +10,7 @@ import numpy as np
 
 from worldstate.abduction.evidence import posterior_of
 from worldstate.abduction.road_users import Foreign
-from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED
+from worldstate.abduction.sequence.sequence_model import HORIZONS_S, STATED, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.belief.hidden_bearing import announced, time_to_visible
 from worldstate.belief.kinematics.motion import AZIMUTH
@@ -235,7 +235,8 @@ class SideAlarms:
         belief = self.memory.belief
         if not belief.has_times:
             return [(None, None)] * len(self.advisories)
-        posterior = belief.posterior
+        # In the form of a stream of one hop
+        posterior = SequencePosterior(belief.coming[None], belief.margin_s)
         within = posterior.within()[0].tolist()
         soon = np.add.reduce(posterior.groups[0, :, :STATED], 1).tolist()
         # The times hold for a vehicle that comes; in an empty street they have no meaning.

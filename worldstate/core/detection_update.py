@@ -11,7 +11,7 @@ from worldstate.belief.association import associated
 from worldstate.belief.detection import Detections, Scan, camera_scan, fused, miss_rates, position_scan
 from worldstate.belief.kinematics.cartesian import (
     CartesianBelief,
-    at_position,
+    full_measurement,
     update_bearing,
     update_position,
 )
@@ -268,8 +268,9 @@ def _placed(
     """Return the position of a track after a measured position, or after a bearing if it had a position."""
     place = tracks.place(row)
     if place is None:
-        place, (azimuth_rad, *_) = at_position(detections.positions[by], street.speed_mps), tracks.mean[row]
-        return update_bearing(place, azimuth_rad, tracks.azimuth_std_rad[row]) if tracks.seen[row] else place
+        place = CartesianBelief(*full_measurement(detections.positions[by], street.speed_mps))
+        own = tracks.mean[row, AZIMUTH], tracks.azimuth_std_rad[row]
+        return update_bearing(place, *own) if tracks.seen[row] else place
     if detections.positions:
         return update_position(place, detections.positions[by])
     return update_bearing(place, float(detections.azimuth_rad[by]), float(detections.std_rad[by]))

@@ -109,7 +109,8 @@ class WorldFilter:
         sensors, tracks = sensors_of(memory), published(memory.tracks, settings.street)
         # The last step's relations stay valid until time passes or odometry moves the ego vehicle.
         is_fresh = memory is self._lag.latest and memory.ego is None
-        sounds, before = sound_entities(memory.sounds, settings), last.predicted or memory.sides.hypotheses
+        sounds = sound_entities(memory.sounds, settings)
+        before = last.predicted or memory.belief.sides.hypotheses
         cues = SideAlarms(memory, model).cues(sensors) if self.no_model is None else sound_cues(sounds)
         state = WorldState(
             stamp_ns=memory.stamp_ns,

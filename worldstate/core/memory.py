@@ -7,7 +7,6 @@ from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.road_users import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief, corrected
 from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.sound_tracks import SoundTrack
 from worldstate.belief.track import Track, Tracks
 from worldstate.ground.serialisation import ADDED, Count, Probability, Via
@@ -110,11 +109,6 @@ class Memory:
     ego: EgoBelief | None = None  # Pose from odometry; None without odometry
     # Tracks of sound, used if no model reads the sound
     sounds: tuple[SoundTrack, ...] = field(default=(), metadata=ADDED)
-
-    @property
-    def sides(self) -> SideBelief:
-        """Marginals of the belief over the sides, without messages."""
-        return self.belief.sides
 
     def draft(self) -> "Memory":
         """Return a copy that a step may write into."""

@@ -27,7 +27,7 @@ def heard_beside(memory: Memory, measurement: Measurement, street: StreetModel) 
     near = tracks.moving & (tracks.last_seen_ns >= measurement.stamp_ns - _JUST_LEFT_NS)
     in_view = max(tracks.existence[near].tolist(), default=0.0)
     if memory.belief.has_times:
-        in_view = max(in_view, memory.belief.in_view)
+        in_view = max(in_view, memory.belief.joint.in_view)
     # P(a vehicle that comes into view within three seconds adds at least 1 dB from 300 Hz to 2 kHz); without
     # a vehicle in view it is 0.8 from 3 dB on.
     quiet = falling(heard.excess_db, (street.excess_low_db, street.excess_high_db))

@@ -58,7 +58,7 @@ def _pass_places(before: Tracks, memory: Memory, model: FilterModel) -> None:
     tracks, street, emerged, gone = memory.tracks, model.site.street, list[int](), list[int]()
     now = {name: row for row, name in enumerate(tracks.id)}
     # Without a position it would become a sound-only entity; on a side without sound it is removed.
-    heard = [chance >= street.birth for chance in memory.sides.hidden]
+    heard = [chance >= street.birth for chance in memory.belief.sides.hidden]
     for old in (before.placed & ~before.seen).nonzero()[0].tolist():
         row, side = now[before.id[old]], int(before.side[old])
         if before.behind[old] >= 0.5 > tracks.behind[row]:

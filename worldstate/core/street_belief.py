@@ -18,7 +18,6 @@ from worldstate.abduction.sequence.sequence_model import (
     OTHERS,
     SMOOTHED_HOPS,
     SequenceAlarm,
-    SequencePosterior,
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.belief.arrival_rate import ArrivalRate
@@ -144,16 +143,6 @@ class StreetBelief:
         """Return the state of the alarm's budget; None without an alarm curve."""
         alarm = self.alarm
         return None if alarm is None else budget_of(self.watch, stamp_ns, alarm)
-
-    @property
-    def in_view(self) -> float:
-        """P(a vehicle is in view)."""
-        return min(self.joint.in_view, 1.0)
-
-    @property
-    def posterior(self) -> SequencePosterior:
-        """Distribution of the time to visible, in the form of a stream of one hop."""
-        return SequencePosterior(self.coming[None], self.margin_s)
 
     @property
     def coming(self) -> FloatArray:

@@ -48,11 +48,6 @@ class CartesianBelief(GaussianBelief):
         return _longest(self.covariance[2:, 2:])
 
 
-def at_position(position: Position, speed_std_mps: float) -> CartesianBelief:
-    """Return the belief over an object after its first measured position."""
-    return CartesianBelief(*full_measurement(position, speed_std_mps))
-
-
 def full_measurement(position: Position, speed_std_mps: float) -> tuple[FloatArray, FloatArray]:
     """Return a measurement of all four components; an unknown velocity is 0 with a wide deviation."""
     noise = np.diag([0.0, 0.0, speed_std_mps**2, speed_std_mps**2])
