@@ -3,16 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+from street_measurements import hop, reading
 
-from worldstate import Measurement, NotUsable, SignatureEvidence, WorldFilter, WorldState
+from worldstate import WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.sequence.sequence_model import GROUPS
 from worldstate.measurement import Look
 from worldstate.state import Classification
 from worldstate.state.sensor import Ego
 
-SILENT, FLAT = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 # In the map its front points to the left of the x axis.
 EGO = Ego((100.0, 50.0), 0.5 * np.pi, ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, 1e-4)), 0.0, 0.0, True)
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
@@ -20,14 +19,15 @@ SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 def scripted_states(hops: int = 5) -> list[WorldState]:
     """Return one snapshot per hop with a hidden vehicle on the left, and two of it in view."""
-    world, states = WorldFilter(), []
-    for hop in range(1, hops + 1):
-        sides = np.stack([_heard(0.9), _heard(0.01)])
-        reading = SequenceReading(sides, SHARE, 0.2, SequenceAlarm(1.0, 20.0))
-        look = Look("camera", hop * 10**8, Absent(0.1, 0.01))
-        world = world.update(
-            Measurement(hop * 10**8, FLAT, look.answer, SILENT, SILENT, (), look, None, sequence=reading)
-        )
+    world, states, coming = WorldFilter(), [], np.array([0.9, 0.01])
+    # The other bins are empty; a vehicle on both sides is one of unknown side.
+    bins = {name: 0.0 for name in GROUPS if name.startswith("coming")}
+    rest = {name: 0.08 * (1.0 - coming) for name in GROUPS if name not in bins}
+    weights = bins | rest | {"coming_2s": coming, "seen": 0.6 * (1.0 - coming)}
+    said = replace(reading(weights, 1.0, share=SHARE), margin_s=0.2)
+    for number in range(1, hops + 1):
+        look = Look("camera", number * 10**8, Absent(0.1, 0.01))
+        world = world.update(hop(number, answer=look.answer, look=look, sequence=said))
         states.append(replace(world.state, ego=EGO))
     return [*states[1:], *_in_view(states[-1])]
 
@@ -43,10 +43,3 @@ def _in_view(last: WorldState) -> list[WorldState]:
     placed = replace(seen, position_m=(8.0, 4.4, 0.0), velocity_mps=(0.0, -4.0, 0.0), range_m=9.1)
     after = [replace(last, stamp_ns=last.stamp_ns + 10**8 * k, seq=last.seq + k) for k in (1, 2)]
     return [replace(after[0], entities=(seen,)), replace(after[1], entities=(placed,))]
-
-
-def _heard(coming: float) -> np.ndarray:
-    # The other groups are empty; a vehicle on both sides is one of unknown side.
-    groups = np.where([one.startswith("coming") for one in GROUPS], 0.0, 0.08 * (1.0 - coming))
-    groups[GROUPS.index("coming_2s")], groups[GROUPS.index("seen")] = coming, 0.6 * (1.0 - coming)
-    return groups

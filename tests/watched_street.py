@@ -4,33 +4,30 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from street_measurements import car, hop, reading
 
-from worldstate import Measurement, Sighting
+from worldstate import Measurement
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.ground.values import NotUsable
 from worldstate.measurement import Look
 
-SIDES, SILENT, HOP_NS, START_NS = ("left", "right"), NotUsable("not scripted"), 10**8, 3600 * 10**9
-NOTHING = SignatureEvidence(SIDES, (-1.0, -1.0), -1.0, 1.0)
+SIDES, HOP_NS, START_NS = ("left", "right"), 10**8, 3600 * 10**9
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 ALARM = SequenceAlarm(0.0, 4.0)  # Four onsets per hour
 
 
 def heard(number: int, loud: str | None, answer: CoEvidence, level: float = 20.0) -> Measurement:
     """Return a hop with evidence `level` for a vehicle on a side."""
-    groups = np.full((2, len(GROUPS)), 1e-3)
-    groups[:, -1] = 1.0
+    weights = np.full((2, len(GROUPS)), 1e-3)
+    weights[:, -1] = 1.0
     if loud is not None:
         side = SIDES.index(loud)
-        groups[side, GROUPS.index("coming_2s")] += level
-        groups[1 - side, GROUPS.index("other")] += level
-    said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, ALARM)
-    stamp_ns = START_NS + number * HOP_NS
-    look = Look("camera", stamp_ns, answer)
-    return Measurement(stamp_ns, NOTHING, answer, SILENT, SILENT, look=look, sequence=said)
+        weights[side, GROUPS.index("coming_2s")] += level
+        weights[1 - side, GROUPS.index("other")] += level
+    said = replace(reading(weights, share=SHARE), alarm=ALARM)
+    at, nats = START_NS // HOP_NS + number, (-1.0, -1.0, -1.0, 1.0)
+    look = Look("camera", at * HOP_NS, answer)
+    return hop(at, nats, answer=answer, look=look, sequence=said)
 
 
 def false_alarms(
@@ -50,5 +47,5 @@ def arrival(first: int, level: float = 20.0) -> Iterator[Measurement]:
         seen = 80 <= number < 92
         answer = (Present if seen else Absent)(0.04, 0.01)
         one = heard(first + number, "left" if 60 <= number < 80 else None, answer, level)
-        boxes = (Sighting(0.53 - 0.04 * (number - 80), 0.02, "car", 0.9),) if seen else ()
+        boxes = (car(0.53 - 0.04 * (number - 80)),) if seen else ()
         yield replace(one, sightings=boxes)

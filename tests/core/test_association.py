@@ -9,18 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from street_measurements import after, car, diagonal, hop
 
-from worldstate import Measurement, Sighting, WorldFilter
+from worldstate import Sighting, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present
-from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.belief.association import FORBIDDEN, association_probabilities, joint_association, propagated
-from worldstate.ground.values import NotUsable
 from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
 
 FOUND, CLUTTER, RANGE_M, BIRTHS = 0.7, 0.1, 1e3, 0.05
 RADAR = SearchedSector(Sector(0.0, 1.2), RANGE_M, FOUND, CLUTTER)
 SCAN_S, STD = 0.5, 1.0
-NOISE = tuple(map(tuple, (np.eye(4) * STD**2).tolist()))
+NOISE = diagonal(*[STD] * 4)
 
 
 def scan(number, places):
@@ -58,15 +57,8 @@ def stone_soup_chances(before, places):
     anybody = 1.0 / (2.0 * math.pi * (STD**2 + 15.0**2))
     density = (BIRTHS - math.log1p(-CLUTTER)) / (RADAR.sector.half_width_rad * RANGE_M**2) * anybody
     still = CombinedLinearGaussianTransitionModel([RandomWalk(0.0)] * 4)
-    association = JPDA(
-        OfExistence(
-            KalmanPredictor(still),
-            KalmanUpdater(model),
-            clutter_spatial_density=density,
-            prob_gate=1.0,
-            include_all=True,
-        )
-    )
+    options = {"clutter_spatial_density": density, "prob_gate": 1.0, "include_all": True}
+    association = JPDA(OfExistence(KalmanPredictor(still), KalmanUpdater(model), **options))
     found = [Detection(np.array([*place, 0.0, 0.0]), now, measurement_model=model) for place in places]
     joint = association.associate(set(existence), set(found), now)
     return [sum(float(one.probability) for one in joint[track] if one) for track in existence]
@@ -81,13 +73,11 @@ def test_existence_is_summed_over_the_joint_events_of_stone_soups_jpda(seed):
     again = places[: rng.integers(1, 4)] + rng.normal(0.0, 0.5, (1, 2))
     world = WorldFilter().update(scan(1, places.tolist()))
     before = world.predict(SCAN_S).state.entities
-    after = {
-        one.id: one.existence_probability for one in world.update(scan(2, again.tolist())).state.entities
-    }
+    now = {one.id: one.existence_probability for one in world.update(scan(2, again.tolist())).state.entities}
     for one, chance in zip(before, stone_soup_chances(before, again.tolist()), strict=True):
         r, p = one.existence_probability, FOUND
         missed = r * (1 - p) / (1 - r * p)
-        assert after[one.id] == pytest.approx(chance + (1 - chance) * missed, abs=1e-9)
+        assert now[one.id] == pytest.approx(chance + (1 - chance) * missed, abs=1e-9)
 
 
 def counted(log_ratios):
@@ -135,10 +125,16 @@ def test_a_crowd_uses_the_likeliest_event_and_all_for_existence():
     assert found.chances == pytest.approx([0.98] * 8, abs=0.01)
 
 
-def looked(time_s, nats, *sightings, kinds=()):
-    heard, unknown = SignatureEvidence(("left", "right"), nats, 0.0, 0.0), NotUsable("not scripted")
-    answer = Present(0.04) if sightings else Absent(0.04)
-    return Measurement(round(time_s * 1e9), heard, answer, unknown, unknown, sightings, kinds=kinds)
+def looked(number, nats, *boxes, **parts):
+    answer = Present(0.04) if boxes else Absent(0.04)
+    return hop(number, (*nats, 0.0, 0.0), *boxes, answer=answer, **parts)
+
+
+def heard(nats, **parts):
+    """Return the filter after three seconds of a hidden vehicle, and its id."""
+    world = after(*(looked(number, nats, **parts) for number in range(1, 30)))
+    (hidden,) = world.state.entities
+    return world, hidden.id
 
 
 @pytest.mark.parametrize(
@@ -146,53 +142,40 @@ def looked(time_s, nats, *sightings, kinds=()):
 )
 def test_a_hand_over_needs_a_matching_class(label, same):
     """At the edge of the other side; detectors label a van as a car or as a truck."""
-    world = WorldFilter()
-    for hop in range(1, 30):
-        world = world.update(looked(hop / 10, (3.0, 0.0), kinds=(("truck", 0.4), ("van", 0.6))))
-    (heard,) = world.state.entities
-    seen = world.update(looked(3.0, (3.0, 0.0), Sighting(-0.75, 0.02, label, 0.9))).state.entities
-    assert {one.status: one.id == heard.id for one in seen}["visible"] == same
+    world, name = heard((3.0, 0.0), kinds=(("truck", 0.4), ("van", 0.6)))
+    seen = world.update(looked(30, (3.0, 0.0), Sighting(-0.75, 0.02, label, 0.9))).state.entities
+    assert {one.status: one.id == name for one in seen}["visible"] == same
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("azimuth_rad", "width_rad", "same"), [(0.44, 0.08, True), (0.25, 0.27, False)])
 def test_a_hand_over_needs_a_box_at_the_edge(sign, azimuth_rad, width_rad, same):
     """A vehicle that leaves a parking space is wholly visible, so the hidden one is another vehicle."""
-    world = WorldFilter()
-    for hop in range(1, 30):
-        world = world.update(looked(hop / 10, (3.0, 0.0) if sign > 0.0 else (0.0, 3.0)))
-    (heard,) = world.state.entities
-    car = Sighting(sign * azimuth_rad, 0.02, "car", 0.9, width_rad)
-    after = world.update(looked(3.0, (0.0, 0.0), car)).state.entities
-    assert {one.status: one.id == heard.id for one in after}["visible"] == same
-    assert heard.id in {one.id for one in after}
+    world, name = heard((3.0, 0.0)[:: int(sign)])
+    box = car(sign * azimuth_rad, width_rad=width_rad)
+    seen = world.update(looked(30, (0.0, 0.0), box)).state.entities
+    assert {one.status: one.id == name for one in seen}["visible"] == same
+    assert name in {one.id for one in seen}
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("azimuth_rad", "width_rad", "leaves"), [(0.34, 0.4, True), (0.53, 0.05, False)])
 def test_a_leaving_vehicle_does_not_take_the_identity_of_a_coming_one(sign, azimuth_rad, width_rad, leaves):
     """A leaving vehicle has passed the edge; a box at the edge belongs to the hidden vehicle behind it."""
-    world, nats = WorldFilter(), (3.0, 0.0) if sign > 0.0 else (0.0, 3.0)
-    for hop in range(1, 30):
-        world = world.update(looked(hop / 10, nats))
-    (heard,) = world.state.entities
-    for hop in range(30, 37):
-        car = Sighting(sign * (0.045 * (hop - 30) - 0.02), 0.02, "car", 0.9, 0.5)
-        world = world.update(looked(hop / 10, nats, car))
-    for hop in range(37, 40):
-        world = world.update(looked(hop / 10, nats))
-    car = Sighting(sign * azimuth_rad, 0.02, "car", 0.9, width_rad)
-    (seen,) = (one for one in world.update(looked(4.0, nats, car)).state.entities if one.last_seen_ns == 4e9)
-    assert (seen.id != heard.id) == leaves
+    nats = (3.0, 0.0)[:: int(sign)]
+    world, name = heard(nats)
+    boxes = [[car(sign * (0.045 * at - 0.02), width_rad=0.5)] * (at < 7) for at in range(10)]
+    boxes.append([car(sign * azimuth_rad, width_rad=width_rad)])
+    world = after(*(looked(number, nats, *one) for number, one in enumerate(boxes, 30)), world=world)
+    (seen,) = (one for one in world.state.entities if one.last_seen_ns == 4e9)
+    assert (seen.id != name) == leaves
 
 
 def test_an_ambiguous_box_lowers_the_existence_of_neither_vehicle():
     """Two cars are a degree apart with one box between them; a missed look would lower both."""
-    world = WorldFilter()
-    for hop in range(1, 8):
-        both = [Sighting(azimuth, 0.03, "car", 0.9) for azimuth in (0.0, 0.02)]
-        world = world.update(looked(hop / 10, (0.0, 0.0), *both))
-    left = world.update(looked(1.0, (0.0, 0.0), Sighting(0.01, 0.03, "car", 0.9))).state.entities
+    both = car(0.0, 0.03), car(0.02, 0.03)
+    world = after(*(looked(number, (0.0, 0.0), *both) for number in range(1, 8)))
+    left = world.update(looked(10, (0.0, 0.0), car(0.01, 0.03))).state.entities
     assert len(left) == 2 and all(one.existence_probability > 0.5 for one in left)
-    gone = world.update(looked(1.0, (0.0, 0.0))).state.entities
+    gone = world.update(looked(10, (0.0, 0.0))).state.entities
     assert all(one.existence_probability < 0.9 * left[0].existence_probability for one in gone)

@@ -7,52 +7,58 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from street_measurements import (
+    ABSENT,
+    PRESENT,
+    SEEDS,
+    SHARE,
+    after,
+    car,
+    diagonal,
+    hop,
+    ordinary,
+    reading,
+    run,
+)
 
 from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.road_users import Foreign
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
+from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks
-from worldstate.ground.values import NotUsable
 from worldstate.measurement import Look, Position, PositionScan, SearchedSector, Sector
-from worldstate.state import Event, Priors, Rates
+from worldstate.state import Priors, Rates
 
-SEEDS = st.integers(0, 2**32 - 1)
-SILENT, UNASKED = NotUsable("not scripted"), Unqueried("no camera")
-SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 SOON = np.array(COMING_S) <= 3.0
+LOUD, SILENCE = (4.0, -1.0, -1.0, -4.0), (-4.0, -1.0, -1.0, 4.0)
 
 
-def script(rng: np.random.Generator, hops: int, sequence: bool) -> list[Measurement]:
+def script(seed: int, hops: int, sequence: bool) -> list[Measurement]:
     """Return sound near its threshold with some looks, boxes and gaps of two seconds."""
-    measured, stamp_ns = [], 0
+    rng, number, measured = np.random.default_rng(seed), 0, []
     for _ in range(hops):
-        stamp_ns += 10**8 if rng.random() < 0.9 else 2 * 10**9
-        levels = rng.normal(0.0, 2.0, 4).tolist()
-        heard = SignatureEvidence(("left", "right"), (levels[0] + 2.0, levels[1]), levels[2], levels[3])
-        groups = rng.dirichlet(np.full(len(GROUPS), 0.2), 2)
-        said = SequenceReading(groups, SHARE, 0.0, SequenceAlarm(-0.5, 20.0)) if sequence else None
-        answer: CoEvidence = (UNASKED, Absent(0.1, 0.01), Present(0.1, 0.01))[int(rng.integers(0, 3))]
-        look = None if isinstance(answer, Unqueried) else Look("camera", stamp_ns, answer)
-        azimuths = rng.uniform(-0.55, 0.55, 2) if isinstance(answer, Present) else ()
-        boxes = tuple(Sighting(float(azimuth), 0.02, "car", 0.9) for azimuth in azimuths)
-        measured.append(Measurement(stamp_ns, heard, answer, SILENT, SILENT, boxes, look=look, sequence=said))
+        number += 1 if rng.random() < 0.9 else 20
+        one = ordinary(rng, number, sequence)
+        left, right = one.signature.hidden
+        measured.append(replace(one, signature=replace(one.signature, hidden=(left + 2.0, right))))
     return measured
 
 
-def run(measured: list[Measurement], world: WorldFilter | None = None) -> list[WorldFilter]:
-    world = world or WorldFilter()
-    return [world := world.update(one) for one in measured]
+def passing(begin: int, end: int, *nats: tuple[float, ...], turns: float, hops: int) -> list[Measurement]:
+    """Return a vehicle that is heard until it is in view from `begin` to `end`, from 0.55 rad on."""
+    told = []
+    for number in range(1, hops):
+        boxes = [car(0.55 - turns * (number - begin))] if begin <= number < end else []
+        told.append(hop(number, nats[number >= begin], *boxes, answer=PRESENT if boxes else ABSENT))
+    return told
 
 
 @given(SEEDS, st.booleans())
 @settings(max_examples=2)
 def test_an_advisory_has_its_onset_and_ends_at_its_expiry(seed: int, sequence: bool) -> None:
-    worlds = run(script(np.random.default_rng(seed), 20, sequence))
+    worlds = run(WorldFilter(), script(seed, 20, sequence))
     since: dict[str, int] = {}
     for before, world in zip([None, *worlds], worlds, strict=False):
         for cue in world.state.cues:
@@ -80,11 +86,11 @@ def _named(state: WorldState, side: str) -> bool:
 @settings(max_examples=3)
 def test_evidence_terms_of_a_sequence_sum_to_the_log_odds(seed: int, hidden: float) -> None:
     context = Context(priors=Priors(hidden, 0.0, 1.0 - hidden))
-    for world in run(script(np.random.default_rng(seed), 20, sequence=True), WorldFilter(context)):
+    for world in run(WorldFilter(context), script(seed, 20, sequence=True)):
         memory = world.memory
         assert memory is not None and memory.belief.has_times
         for k, cue in enumerate(world.state.cues):
-            soon = memory.belief.posterior.groups[0, k][SOON].sum()
+            soon = memory.belief.coming[k][SOON].sum()
             assert cue.evidence is not None and cue.evidence.hypothesis == "coming"
             terms = cue.evidence.terms_nats
             assert sum(terms.values()) == pytest.approx(math.log(soon / (1.0 - soon)), abs=1e-9)
@@ -94,16 +100,9 @@ def test_evidence_terms_of_a_sequence_sum_to_the_log_odds(seed: int, hidden: flo
 
 def test_a_detection_counts_against_a_coming_vehicle() -> None:
     """If the sound fits a visible and a coming vehicle, an empty look supports the coming one."""
-    said, terms = script(np.random.default_rng(0), 1, sequence=True)[0], {}
-    assert isinstance(said.sequence, SequenceReading)
-    groups = np.full(said.sequence.groups.shape, 1e-3)
-    groups[:, [GROUPS.index(name) for name in ("coming_1s", "seen", "none")]] = 0.4, 0.4, 0.2
-    heard = replace(said.sequence, groups=groups / groups.sum(axis=1, keepdims=True))
-    for answer in (Absent(0.1, 0.01), Present(0.1, 0.01)):
-        look = Look("camera", said.stamp_ns, answer)
-        hop = replace(said, co_evidence=answer, look=look, sightings=(), sequence=heard)
-        evidence = run([hop])[0].state.cues[0].evidence
-        assert evidence is not None
+    said, terms = reading({"coming_1s": 0.4, "seen": 0.4, "none": 0.2}), {}
+    for answer in (ABSENT, PRESENT):
+        evidence = after(hop(1, answer=answer, sequence=said)).state.cues[0].evidence
         terms[type(answer)] = evidence.terms_nats
     assert terms[Absent]["looks"] > 0.0 > terms[Present]["looks"]
     assert terms[Absent]["sequence"] == terms[Present]["sequence"]
@@ -114,9 +113,8 @@ def test_a_detection_counts_against_a_coming_vehicle() -> None:
 def test_evidence_terms_of_windows_sum_to_the_log_odds(seed: int) -> None:
     """The statistic of one window is separate: it has the priors of the policy and no memory."""
     looked, two = False, False
-    for world in run(script(np.random.default_rng(seed), 20, sequence=False)):
-        look = _last(world)
-        looked |= not isinstance(look, Unqueried)
+    for world in run(WorldFilter(), script(seed, 20, sequence=False)):
+        looked |= not isinstance(world.lag.arrivals[-1].measurement.co_evidence, Unqueried)
         hidden = world.belief.hidden_on(None)
         for cue in world.state.cues:
             terms = cue.evidence.terms_nats
@@ -136,38 +134,25 @@ def test_evidence_terms_of_windows_sum_to_the_log_odds(seed: int) -> None:
 @pytest.mark.parametrize("sequence", [False, True])
 def test_an_advisory_of_messages_has_the_hypothesis_announced(sequence: bool) -> None:
     """Both sides are quiet; a vehicle on the left sends its position."""
-    flat = SignatureEvidence(("left", "right"), (-3.0, -3.0), -1.0, 1.0)
-    said = SequenceReading(np.stack([SHARE, SHARE]), SHARE, 0.0, SequenceAlarm(2.5, 20.0))
-    world = WorldFilter()
-    for hop in range(1, 9):
-        car = Position((10.0, 30.0 - 0.8 * hop), tuple(map(tuple, np.diag([0.5] * 4))), (0.0, -8.0), 0.95)
-        sound = Measurement(hop * 10**8, flat, UNASKED, SILENT, SILENT, sequence=said if sequence else None)
-        world = world.update(PositionScan("v2x", hop * 10**8 - 10**7, (car,))).update(sound)
+    said, world = reading(SHARE, 2.5) if sequence else None, WorldFilter()
+    for number in range(1, 9):
+        there = Position((10.0, 30.0 - 0.8 * number), diagonal(0.7, 0.7, 0.7, 0.7), (0.0, -8.0), 0.95)
+        message = PositionScan("v2x", number * 10**8 - 10**7, (there,))
+        world = after(message, hop(number, (-3.0, -3.0, -1.0, 1.0), sequence=said), world=world)
     left, right = world.state.cues
     assert left.advisory is not None and right.advisory is None
-    assert left.evidence is not None and right.evidence is not None
-    assert (left.evidence.hypothesis, right.evidence.hypothesis) == (
-        "announced",
-        "coming" if sequence else "hidden",
-    )
+    hypotheses = left.evidence.hypothesis, right.evidence.hypothesis
+    assert hypotheses == ("announced", "coming" if sequence else "hidden")
     assert left.evidence.compared_nats == pytest.approx(sum(left.evidence.terms_nats.values()))
     assert left.evidence.compared_nats >= left.evidence.threshold_nats > right.evidence.compared_nats
     assert {one.sensor for one in left.advisory.sensors} == {"acoustic", "v2x"}
 
 
-def _last(world: WorldFilter) -> CoEvidence:
-    assert world.lag is not None
-    return world.lag.arrivals[-1].measurement.co_evidence
-
-
 def test_sensors_are_working_impaired_or_silent() -> None:
-    flat = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
     dark = Look("camera", 9 * 10**8, Absent(0.83, 0.01))
-    hop = Measurement(
-        10**9, flat, dark.answer, SILENT, SILENT, look=dark, domain=Foreign("sounds like speech", 2.0)
-    )
-    radio = Measurement(11 * 10**8, flat, UNASKED, SILENT, SILENT, source="v2x", fault="antenna fault")
-    world = WorldFilter().update(hop).update(radio)
+    sound = hop(10, answer=dark.answer, look=dark, domain=Foreign("sounds like speech", 2.0))
+    radio = hop(11, source="v2x", fault="antenna fault")
+    world = after(sound, radio)
     told = {one.sensor: (one.condition, one.stamp_ns, one.reason) for one in world.state.sensors}
     assert told == {
         "acoustic": ("impaired", 10**9, "sounds like speech"),
@@ -177,26 +162,19 @@ def test_sensors_are_working_impaired_or_silent() -> None:
     (view,) = world.state.searched
     assert (view.sensor, view.stamp_ns, view.found, view.miss_rate) == ("camera", 9 * 10**8, False, 0.83)
     later = world.update(replace(radio, stamp_ns=2 * 10**9, fault=None)).state
-    assert [one.condition for one in later.sensors] == [
-        "working" if s == "v2x" else c
-        for s, c in (("acoustic", "impaired"), ("camera", "silent"), ("v2x", "working"))
-    ]
+    assert [one.condition for one in later.sensors] == ["impaired", "silent", "working"]
     assert later.valid_until_ns == 3 * 10**9
     assert WorldFilter().state.valid_until_ns is None
 
 
 def test_a_scan_is_a_look_at_its_own_sector_and_a_message_at_none() -> None:
     sector = SearchedSector(Sector(0.2, 0.5), range_m=70.0, detection_probability=0.9)
-    car = Position((12.0, 3.0), ((0.2, 0.0), (0.0, 0.4)))
-    world = WorldFilter().update(PositionScan("radar", 10**9, (), sector))
-    world = world.update(PositionScan("v2x", 10**9 + 1, (car,)))
+    there = Position((12.0, 3.0), ((0.2, 0.0), (0.0, 0.4)))
+    world = after(PositionScan("radar", 10**9, (), sector), PositionScan("v2x", 10**9 + 1, (there,)))
     (view,) = world.state.searched
     assert (view.sensor, view.found) == ("radar", False)
     assert (view.miss_rate, *view.sector_rad) == pytest.approx((0.1, -0.3, 0.7))
-    assert [(one.sensor, one.condition) for one in world.state.sensors] == [
-        ("radar", "working"),
-        ("v2x", "working"),
-    ]
+    assert [one.condition for one in world.state.sensors] == ["working", "working"]
     assert world.state.valid_until_ns == 2 * 10**9 + 1
     assert [event.kind for event in world.state.events] == ["born"]
 
@@ -204,9 +182,8 @@ def test_a_scan_is_a_look_at_its_own_sector_and_a_message_at_none() -> None:
 def test_azimuths_behind_the_vehicle_are_wrapped() -> None:
     spread = ((0.1, 0.0), (0.0, 0.1))
     for centre_rad, half_rad, y_m in ((math.pi, 0.5, 0.0), (math.pi, 0.5, 1e-9), (0.7, math.pi, -1e-9)):
-        scan = PositionScan("radar", 10**9, (Position((-10.0, y_m), spread),),
-                            SearchedSector(Sector(centre_rad, half_rad), 70.0, 0.9))  # fmt: skip
-        state = WorldFilter().update(scan).state
+        searched = SearchedSector(Sector(centre_rad, half_rad), 70.0, 0.9)
+        state = after(PositionScan("radar", 10**9, (Position((-10.0, y_m), spread),), searched)).state
         (one,), (view,) = state.entities, state.searched
         azimuths = one.azimuth_rad, *(at for at, _ in (one.forecast or {}).values()), *view.sector_rad
         assert all(-math.pi <= azimuth <= math.pi for azimuth in azimuths)
@@ -217,9 +194,7 @@ def test_azimuths_behind_the_vehicle_are_wrapped() -> None:
 
 def test_a_high_risk_without_sound_has_its_reason() -> None:
     slow = Context(rates=Rates(emergence_hz=0.02, departure_hz=0.02))
-    heard = SignatureEvidence(("left", "right"), (8.0, 0.0), 0.0, 0.0)
-    sound = [Measurement(hop * 10**8, heard, UNASKED, SILENT, SILENT) for hop in range(1, 20)]
-    world = run(sound, WorldFilter(slow))[-1]
+    world = after(*(hop(number, (8.0, 0.0, 0.0, 0.0)) for number in range(1, 20)), world=WorldFilter(slow))
     assert world.state.cues[0].advisory is not None
     silent = world.predict(1.5).state.cues[0]
     assert silent.advisory is None and silent.risk > 0.7
@@ -231,7 +206,7 @@ def test_a_high_risk_without_sound_has_its_reason() -> None:
 def test_events_account_for_every_entity(seed: int, sequence: bool) -> None:
     alive: dict[str, str] = {}
     kinds = set()
-    for world in run(script(np.random.default_rng(seed), 40, sequence)):
+    for world in run(WorldFilter(), script(seed, 40, sequence)):
         for event in world.state.events:
             kinds.add(event.kind)
             assert event.stamp_ns == world.stamp_ns
@@ -258,15 +233,8 @@ def test_a_snapshot_holds_no_more_than_64_events() -> None:
 
 
 def test_a_pass_is_born_handed_over_coasts_and_dies() -> None:
-    loud, quiet = (SignatureEvidence(("left", "right"), (one, -1.0), -1.0, -one) for one in (4.0, -4.0))
-    told: list[Event] = []
-    world = WorldFilter()
-    for hop in range(1, 120):
-        seen = (Sighting(0.55 - 0.05 * (hop - 20), 0.02, "car", 0.9),) if 20 <= hop < 30 else ()
-        answer = Present(0.04) if seen else Absent(0.04)
-        heard = loud if hop < 20 else quiet
-        world = world.update(Measurement(hop * 10**8, heard, answer, SILENT, SILENT, seen))
-        told += world.state.events
+    worlds = run(WorldFilter(), passing(20, 30, LOUD, SILENCE, turns=0.05, hops=120))
+    told = [one for world in worlds for one in world.state.events]
     assert [one.kind for one in told] == ["born", "handed_over", "coasting", "died"]
     assert len({one.entity_id for one in told}) == 1
 
@@ -276,10 +244,7 @@ def test_a_pass_is_born_handed_over_coasts_and_dies() -> None:
 def test_the_forecast_moves_on_straight_lines(seed: int) -> None:
     """Oracle: positions and velocities drawn from the belief, each moved on a line with noise."""
     rng = np.random.default_rng(seed)
-    flat = SignatureEvidence(("left", "right"), (-3.0, -3.0), 0.0, 0.0)
-    box = Sighting(0.1, 0.02, "car", 0.9)
-    world = WorldFilter().update(Measurement(10**8, flat, Present(0.04), SILENT, SILENT, (box,)))
-    assert world.memory is not None
+    world = after(hop(1, (-3.0, -3.0, 0.0, 0.0), car(0.1), answer=Present(0.04)))
     mean = rng.uniform((-0.5, -0.3, -0.3, math.log(15.0)), (0.5, 0.3, 0.1, math.log(40.0)))
     motion = MotionBelief.around(tuple(mean), (0.03, 0.04, 0.04, 0.01))
     tracks = Tracks.of([replace(world.memory.tracks.rows()[0], motion=motion)])
@@ -299,7 +264,7 @@ def test_the_forecast_moves_on_straight_lines(seed: int) -> None:
 @given(SEEDS)
 @settings(max_examples=2)
 def test_classes_sum_to_one_and_the_hidden_have_a_sector(seed: int) -> None:
-    for world in run(script(np.random.default_rng(seed), 30, sequence=True)):
+    for world in run(WorldFilter(), script(seed, 30, sequence=True)):
         for one in world.state.entities:
             assert math.fsum(kind.probability for kind in one.classification) == pytest.approx(1.0, abs=1e-6)
             hidden = one.status == "hidden"
@@ -312,37 +277,17 @@ def test_classes_sum_to_one_and_the_hidden_have_a_sector(seed: int) -> None:
             assert left - right == pytest.approx(2.0 * 1.6448536 * cue.azimuth_std_rad, abs=2e-6)
 
 
-def box(hop: int, *azimuths: float) -> Measurement:
-    boxes = tuple(Sighting(one, 0.02, "car", 0.9) for one in azimuths)
-    heard = SignatureEvidence(("left", "right"), (-1.0, -1.0), -1.0, -1.0)
-    return Measurement(hop * 10**8, heard, Present(0.3) if boxes else Absent(0.3), SILENT, SILENT, boxes)
-
-
-def test_a_double_detection_of_a_car_becomes_one_entity() -> None:
-    world = WorldFilter()
-    for hop in range(1, 40):
-        world = world.update(box(hop, 0.1, 0.13) if 2 <= hop < 8 else box(hop, 0.13))
-    assert len(world.state.entities) == 1
-
-
-def test_two_detected_cars_stay_two() -> None:
-    world = WorldFilter()
-    for hop in range(1, 40):
-        world = world.update(box(hop, 0.1, 0.13))
-    assert len(world.state.entities) == 2
+@pytest.mark.parametrize(("twice", "entities"), [(range(2, 8), 1), (range(1, 40), 2)])
+def test_a_double_detection_becomes_one_entity_and_two_cars_stay_two(twice: range, entities: int) -> None:
+    boxes = [(car(0.1), car(0.13)) if number in twice else (car(0.13),) for number in range(1, 40)]
+    told = (hop(number, (-1.0,) * 4, *seen, answer=Present(0.3)) for number, seen in enumerate(boxes, 1))
+    assert len(after(*told).state.entities) == entities
 
 
 def test_a_vehicle_of_both_sides_is_one_entity_at_the_hand_over() -> None:
-    told: list[Event] = []
-    both, none = (SignatureEvidence(("left", "right"), (one, one), 0.0, 0.0) for one in (4.0, -4.0))
-    world = WorldFilter()
-    for hop in range(1, 60):
-        seen = (Sighting(0.55 - 0.03 * (hop - 30), 0.02, "car", 0.9),) if hop >= 30 else ()
-        answer = Present(0.04) if seen else Absent(0.04)
-        world = world.update(
-            Measurement(hop * 10**8, both if hop < 30 else none, answer, SILENT, SILENT, seen)
-        )
-        told += world.state.events
+    both, none = (4.0, 4.0, 0.0, 0.0), (-4.0, -4.0, 0.0, 0.0)
+    *_, world = worlds = run(WorldFilter(), passing(30, 60, both, none, turns=0.03, hops=60))
+    told = [one for world in worlds for one in world.state.events]
     (found,) = (one for one in told if one.kind == "handed_over")
     assert [one.id for one in world.state.entities] == [found.entity_id]
     assert [one.kind for one in told] == ["born", "handed_over"]
@@ -350,17 +295,11 @@ def test_a_vehicle_of_both_sides_is_one_entity_at_the_hand_over() -> None:
 
 def test_a_relation_has_its_start_and_end() -> None:
     """`occluded_by` holds from the birth to the hand-over and stays listed for five more seconds."""
-    loud, quiet = (SignatureEvidence(("left", "right"), (one, -1.0), 0.0, 0.0) for one in (6.0, -4.0))
-    told, world = {}, WorldFilter()
-    for hop in range(1, 95):
-        seen = (Sighting(0.55 - 0.003 * (hop - 20), 0.02, "car", 0.9),) if hop >= 20 else ()
-        answer = Present(0.04) if seen else Absent(0.04)
-        heard = loud if hop < 20 else quiet
-        world = WorldFilter.from_dict(
-            world.update(Measurement(hop * 10**8, heard, answer, SILENT, SILENT, seen)).to_dict()
-        )
-        told[hop] = {one.kind: (one.since_ns, one.until_ns) for one in world.state.relations}
-    (born,) = {since for hop in told for since, _ in [told[hop].get("occluded_by", (None, 0))] if since}
+    loud, quiet, told, world = (6.0, -1.0, 0.0, 0.0), (-4.0, -1.0, 0.0, 0.0), {}, WorldFilter()
+    for number, one in enumerate(passing(20, 95, loud, quiet, turns=0.003, hops=95), 1):
+        world = WorldFilter.from_dict(world.update(one).to_dict())
+        told[number] = {one.kind: (one.since_ns, one.until_ns) for one in world.state.relations}
+    (born,) = {kinds["occluded_by"][0] for kinds in told.values() if "occluded_by" in kinds}
     assert told[19]["occluded_by"] == (born, None)
     assert told[20]["occluded_by"] == told[69]["occluded_by"] == (born, 2 * 10**9)
     assert told[94] == {"emerged_from": (2 * 10**9, None)}
@@ -372,18 +311,10 @@ def test_a_relation_has_its_start_and_end() -> None:
 @pytest.mark.parametrize("none", [2.0, 4.0])
 def test_a_silent_visible_person_makes_no_hidden_vehicle(reads: bool, none: float) -> None:
     """A silent person is visible for ten seconds."""
-    share = np.full(len(GROUPS), 0.02)
-    share[[GROUPS.index("none"), GROUPS.index("seen")]] = 0.5, 0.2
-    groups = np.full((2, len(GROUPS)), 0.002)
-    groups[:, [GROUPS.index("none"), GROUPS.index("seen")]] = 0.95, 0.1 / none
-    reading = SequenceReading(
-        groups / groups.sum(axis=1, keepdims=True), share / share.sum(), 0.0, SequenceAlarm(-0.5, 20.0)
-    )
-    quiet, found = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, none), Present(0.04, 0.01)
-    person, world, off = Sighting(0.1, 0.02, "person", 0.9), WorldFilter(), NotUsable("-")
-    for number in range(1, 101):
-        look = Look("camera", number * 10**8, found)
-        said = Measurement(number * 10**8, quiet, found, off, off, (person,), look=look)
-        world = world.update(replace(said, sequence=reading if reads else None))
+    share = reading({"none": 0.5, "seen": 0.2}, rest=0.02).groups[0]
+    said = reading({"none": 0.95, "seen": 0.1 / none}, -0.5, rest=0.002, share=share) if reads else None
+    person = Sighting(0.1, 0.02, "person", 0.9)
+    told = (hop(at, (0.0, 0.0, 0.0, none), person, answer=PRESENT, sequence=said) for at in range(1, 101))
+    for world in run(WorldFilter(), told):
         assert not any(cue.advisory for cue in world.state.cues)
     assert max(world.belief.hidden) < 0.05

@@ -6,57 +6,39 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from street_measurements import (
+    ABSENT,
+    PRESENT,
+    SEEDS,
+    UNASKED,
+    Timed,
+    after,
+    car,
+    hop,
+    ordinary,
+    ordinary_scan,
+    run,
+)
 
-from worldstate import Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.measurement import Position, PositionScan, SearchedSector, Sector
+from worldstate import Measurement, WorldFilter
+from worldstate.abduction.co_evidence import Absent
 from worldstate.state import Delivery, WorldState
-
-Timed = Measurement | PositionScan
-SEEDS = st.integers(0, 2**32 - 1)
-SILENT = NotUsable("not scripted")
-SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
-
-
-def scan(rng: np.random.Generator, stamp_ns: int, searches: bool) -> PositionScan:
-    """Return a radar scan or messages with positions."""
-    at = (Position((rng.uniform(5, 20), rng.uniform(-20, 20)), ((1.0, 0.2), (0.2, 0.5))) for _ in range(2))
-    at = (replace(one, existence_probability=float(rng.uniform(0.1, 0.9))) for one in at)
-    searched = SearchedSector(Sector(0.0, 1.0), 50.0, 0.8) if searches else None
-    return PositionScan("radar" if searches else "messages", stamp_ns, tuple(at), searched)
 
 
 def script(rng: np.random.Generator, hops: int = 18) -> list[Timed]:
     """Return sound with a camera every 0.1 s, and sometimes a radio and a radar."""
     measured: list[Timed] = []
-    for hop in range(1, hops + 1):
-        left, right, visible, none = rng.normal(0.0, 1.0, 4).tolist()
-        heard = SignatureEvidence(("left", "right"), (left, right), visible, none)
-        reading = SequenceReading(
-            rng.dirichlet(np.ones(len(GROUPS)), 2), SHARE, 0.0, SequenceAlarm(0.0, 20.0)
-        )
-        seen = rng.random() < 0.3
-        boxes = (Sighting(float(rng.uniform(-0.5, 0.5)), 0.02, "car", 0.9),) if seen else ()
-        answer = Present(0.04, 0.01) if seen else Absent(0.04, 0.01)
-        own = Measurement(hop * 10**8, heard, answer, SILENT, SILENT, boxes, sequence=reading)
+    for number in range(1, hops + 1):
+        seen = [car(float(rng.uniform(-0.5, 0.5)))] * (rng.random() < 0.3)
+        own = ordinary(rng, number, spread=1.0)
+        own = replace(own, co_evidence=PRESENT if seen else ABSENT, look=None, sightings=tuple(seen))
         measured.append(own)
         if rng.random() < 0.4:
-            unasked = Unqueried("no camera")
             stamp_ns = own.stamp_ns + int(rng.integers(0, 10**8))
-            measured.append(replace(own, stamp_ns=stamp_ns, co_evidence=unasked, sightings=(), source="v2x"))
+            measured.append(replace(own, stamp_ns=stamp_ns, co_evidence=UNASKED, sightings=(), source="v2x"))
         if rng.random() < 0.2:
-            stamp_ns = own.stamp_ns + int(rng.integers(0, 10**8))
-            measured.append(scan(rng, stamp_ns, rng.random() < 0.5))
+            measured.append(ordinary_scan(rng, number + rng.random(), rng.random() < 0.5))
     return sorted(measured, key=lambda one: (one.stamp_ns, one.source))
-
-
-def filtered(measurements: list[Timed], world: WorldFilter | None = None) -> WorldFilter:
-    world = world or WorldFilter()
-    for one in measurements:
-        world = world.update(one)
-    return world
 
 
 def content(world: WorldFilter) -> WorldState:
@@ -75,8 +57,8 @@ def test_the_order_of_arrival_does_not_matter_within_the_lag(seed: int) -> None:
     rng = np.random.default_rng(seed)
     in_order = script(rng)
     shuffled = arrived_late(rng, in_order)
-    late = filtered(shuffled)
-    assert content(late) == content(filtered(in_order))
+    late = after(*shuffled)
+    assert content(late) == content(after(*in_order))
     assert late.state.delivery.too_late == late.state.delivery.repeated == 0
     assert (late.state.delivery.replayed > 0) == (shuffled != in_order)
 
@@ -106,23 +88,17 @@ def test_events_explain_changes_between_snapshots_with_late_data(seed: int) -> N
 @settings(max_examples=3)
 def test_stamps_of_zero_and_below_are_ordinary(seed: int) -> None:
     """Stamps before zero and at zero behave like others; the camera never misses a vehicle."""
-    rng = np.random.default_rng(seed)
-    sure, told = Absent(0.0, 0.01), []
-    for one in script(rng):
-        if isinstance(one, Measurement) and isinstance(one.co_evidence, Absent):
-            one = replace(one, co_evidence=sure)
-        told.append(one)
-    found = []
-    for since_ns in (10**10, 0, -(10**9), -(10**10)):
-        world = filtered(
-            [replace(one, stamp_ns=one.stamp_ns + since_ns - 10**9) for one in told],
-            WorldFilter(start_ns=since_ns - 10**9),
-        )
-        rows = [
-            (one.id, one.status, one.existence_probability, one.azimuth_rad) for one in world.state.entities
-        ]
-        found.append((rows, [(cue.risk, cue.advisory is None) for cue in world.state.cues]))
-    assert found[0][0] and all(one == found[0] for one in found)
+    told, found = script(np.random.default_rng(seed)), []
+    is_empty = [isinstance(one, Measurement) and isinstance(one.co_evidence, Absent) for one in told]
+    pairs = zip(told, is_empty, strict=True)
+    told = [replace(one, co_evidence=Absent(0.0, 0.01)) if empty else one for one, empty in pairs]
+    for since_ns in (10**10, 0, -(10**9), -(10**10), -(10**13)):
+        moved = (replace(one, stamp_ns=one.stamp_ns + since_ns - 10**9) for one in told)
+        state = after(*moved, world=WorldFilter(start_ns=since_ns - 10**9)).state
+        rows = [(one.id, one.status, one.existence_probability, one.azimuth_rad) for one in state.entities]
+        cues = [(cue.risk, cue.advisory is None, cue.evidence.compared_nats) for cue in state.cues]
+        found.append((rows, cues))
+    assert found[0][1] and all(one == found[0] for one in found)
 
 
 @given(SEEDS)
@@ -131,8 +107,8 @@ def test_a_repeated_delivery_changes_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     once = script(rng)
     often = [copy for one in once for copy in [one] * int(rng.integers(1, 4))]
-    repeated = filtered(often)
-    assert content(repeated) == content(filtered(once))
+    repeated = after(*often)
+    assert content(repeated) == content(after(*once))
     assert repeated.state.delivery == Delivery(repeated=len(often) - len(once))
 
 
@@ -142,31 +118,31 @@ def test_a_checkpoint_accepts_late_measurements_as_the_filter_does(seed: int, cu
     in_order = script(np.random.default_rng(seed))
     late = in_order.pop(cut)
     until = [one for one in in_order if one.stamp_ns <= late.stamp_ns + 15 * 10**8]
-    world = filtered(until).predict(0.03)
+    world = after(*until).predict(0.03)
     copy = WorldFilter.from_dict(json.loads(json.dumps(world.to_dict())))
     rest = [late, *in_order[len(until) :]]
-    assert filtered(rest, copy).state == filtered(rest, world).state
-    assert filtered(rest, world).state.delivery.replayed == 1
+    assert after(*rest, world=copy).state == after(*rest, world=world).state
+    assert after(*rest, world=world).state.delivery.replayed == 1
 
 
 def test_a_measurement_beyond_the_lag_is_counted_and_ignored() -> None:
     in_order = script(np.random.default_rng(1), hops=40)
-    world = filtered(in_order[1:])
+    world = after(*in_order[1:])
     late = world.update(in_order[0])
     assert late.state == replace(world.state, delivery=Delivery(too_late=1))
     # A single stray stamp is no clock change, however old it is.
-    again = filtered([in_order[0], *script(np.random.default_rng(2), hops=50)[-10:]], late)
+    again = after(in_order[0], *script(np.random.default_rng(2), hops=50)[-10:], world=late)
     assert again.state.delivery.reanchored == 0
 
 
 def test_the_filter_continues_two_seconds_after_a_clock_is_set_back() -> None:
     hour_ns = 3600 * 10**9
     before = [replace(one, stamp_ns=one.stamp_ns + hour_ns) for one in script(np.random.default_rng(1))]
-    after = script(np.random.default_rng(2), hops=30)
-    world = filtered(before)
-    taken_ns = [(world := world.update(one)).state.stamp_ns == one.stamp_ns for one in after]
+    later = script(np.random.default_rng(2), hops=30)
+    world = after(*before)
+    taken_ns = [(world := world.update(one)).state.stamp_ns == one.stamp_ns for one in later]
     waited = [
-        one.stamp_ns - after[0].stamp_ns for one, taken in zip(after, taken_ns, strict=True) if not taken
+        one.stamp_ns - later[0].stamp_ns for one, taken in zip(later, taken_ns, strict=True) if not taken
     ]
     assert max(waited) <= 2 * 10**9 and taken_ns[-1]
     assert world.state.delivery.reanchored == 1
@@ -180,7 +156,7 @@ def test_one_stray_stamp_has_no_later_effect(
 ) -> None:
     in_order = script(np.random.default_rng(seed), hops=30)
     stray = replace(in_order[at], stamp_ns=in_order[at].stamp_ns + round(ahead_s * 1e9))
-    straight = stricken = filtered(in_order[:at])
+    straight = stricken = after(*in_order[:at])
     for one in (stray, stray) if again else (stray,):
         stricken = stricken.update(one)
     assert stricken.state.delivery == Delivery(held_back=1, repeated=int(again))
@@ -197,36 +173,31 @@ def test_two_agreeing_stamps_confirm_a_clock_step(seed: int, pause_s: float, oth
     """After a pause or a clock step, the next measurement of any source confirms the new time."""
     *before, one = script(np.random.default_rng(seed))
     ahead_ns = one.stamp_ns + round(pause_s * 1e9)
-    after = [replace(one, source="another") if other else one, one]
-    after = [replace(it, stamp_ns=ahead_ns + k * 10**8) for k, it in enumerate(after)]
-    world = filtered(before)
-    assert content(world.update(after[0])) == content(world)
+    both = [replace(one, source="another") if other else one, one]
+    first, second = (replace(it, stamp_ns=ahead_ns + k * 10**8) for k, it in enumerate(both))
+    world = after(*before)
+    once, twice = world.update(first), after(first, second, world=world)
+    assert content(once) == content(world)
     # After a prediction to that time it is not ahead.
-    expected = filtered(after, world.predict_to(after[0].stamp_ns))
-    both = filtered(after, world)
-    assert content(both) == content(expected) and both.state.delivery == world.state.delivery
+    expected = after(first, second, world=world.predict_to(first.stamp_ns))
     # If the caller predicts to that time in between, the first measurement is not lost.
-    clocked = world.update(after[0]).predict_to(after[1].stamp_ns).update(after[1])
-    assert content(clocked) == content(expected) and clocked.state.delivery == world.state.delivery
-    copy = WorldFilter.from_dict(json.loads(json.dumps(world.update(after[0]).to_dict())))
-    assert copy.update(after[1]).state == both.state
+    for got in (twice, once.predict_to(second.stamp_ns).update(second)):
+        assert content(got) == content(expected) and got.state.delivery == world.state.delivery
+    copy = WorldFilter.from_dict(json.loads(json.dumps(once.to_dict())))
+    assert copy.update(second).state == twice.state
 
 
 def test_a_slow_stream_keeps_its_pace() -> None:
-    one, world = script(np.random.default_rng(3))[0], WorldFilter()
-    reached_s = list[int]()
-    for number in range(1, 7):
-        world = world.update(replace(one, stamp_ns=number * 5 * 10**9))
-        reached_s.append(world.stamp_ns // 10**9)
-    assert reached_s == [5, 5, 15, 20, 25, 30]
-    assert world.state.seq == 6 and world.state.delivery == Delivery()
+    *_, last = worlds = run(WorldFilter(), (hop(50 * number) for number in range(1, 7)))
+    assert [world.stamp_ns // 10**9 for world in worlds] == [5, 5, 15, 20, 25, 30]
+    assert last.state.seq == 6 and last.state.delivery == Delivery()
 
 
 def test_equal_stamps_are_not_late() -> None:
     measured = script(np.random.default_rng(4))
     twins = [replace(one, source=source) for one in measured for source in ("z", "a")]
-    assert filtered(twins).state.delivery == Delivery()
-    assert filtered([twins[2], twins[0]]).state.delivery == Delivery(replayed=1)
+    assert after(*twins).state.delivery == Delivery()
+    assert after(twins[2], twins[0]).state.delivery == Delivery(replayed=1)
 
 
 @given(SEEDS)
@@ -240,4 +211,4 @@ def test_many_small_predictions_are_one(seed: int) -> None:
         for stamp_ns in sorted([*between_ns, max(one.stamp_ns, often.stamp_ns)]):
             often = often.predict_to(stamp_ns)
         often = often.update(one)
-    assert often.state == filtered(measured).state
+    assert often.state == after(*measured).state

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from street_measurements import COMING, SEEDS, drawn_groups
 
-from worldstate.abduction.co_evidence import Absent, Present
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS
+from worldstate.abduction.co_evidence import Absent
+from worldstate.abduction.sequence.sequence_model import GROUPS
 from worldstate.belief.joint_belief import (
     FIRST_BIN,
     NONE,
@@ -25,19 +26,13 @@ from worldstate.belief.joint_belief import (
 from worldstate.belief.street_model import StreetModel
 from worldstate.ground import FloatArray
 
-SEEDS = st.integers(0, 2**32 - 1)
 STREET = StreetModel()
 ALONE = StreetModel(follows=1e-12)  # No vehicle follows directly behind another
 CERTAIN = replace(STREET, works=1.0)  # The camera works
-COMING = len(COMING_S)
-
-
-def groups_of(rng: np.random.Generator, sides: int) -> FloatArray:
-    return np.asarray(0.99 * rng.dirichlet(np.full(len(GROUPS), 0.4), sides) + 0.01 / len(GROUPS))
 
 
 def prior_of(rng: np.random.Generator, sides: int) -> StreetPrior:
-    return StreetPrior.of(groups_of(rng, sides), STREET)
+    return StreetPrior.of(drawn_groups(rng, sides, least=0.01), STREET)
 
 
 def likelihoods(rng: np.random.Generator, sides: int) -> FloatArray:
@@ -161,10 +156,8 @@ def test_a_reading_alone_replaces_the_belief(seed: int) -> None:
     prior = prior_of(rng, 2)
     belief = JointBelief(prior.weights)
     for step_ns in rng.integers(5 * 10**7, 2 * 10**9, 5).tolist():
-        groups = groups_of(rng, 2)
-        groups[:, GROUPS.index("none")] += (
-            1.0  # Otherwise the probabilities of both sides would be inconsistent
-        )
+        groups = drawn_groups(rng, 2, least=0.01)
+        groups[:, GROUPS.index("none")] += 1.0  # Otherwise the sides would be inconsistent
         groups /= groups.sum(axis=1, keepdims=True)
         reading = joint_reading(groups, 0.2, STREET.by_sound)
         belief = belief.carried(prior, STREET, step_ns).read("ear", reading, prior, (0, 1))
@@ -185,22 +178,6 @@ def test_readings_of_the_same_chain_give_the_exact_filter(seed: int) -> None:
         sound, exact = sound.told(heard), exact.told(heard).told(message)
         belief = belief.read("ear", sound.by_part, prior, (0, 1)).told(message)
         np.testing.assert_allclose(belief.weights, exact.weights, atol=1e-9)
-
-
-@given(SEEDS)
-@settings(max_examples=5, deadline=None)
-def test_mirrored_evidence_gives_the_mirrored_belief(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    one = prior_of(rng, 1).sides[0]
-    prior = StreetPrior((one, one), 0.05)
-    here = there = JointBelief(prior.weights)
-    for _ in range(3):
-        told, answer = likelihoods(rng, 2), (Absent(0.05), Present(0.05))[rng.integers(2)]
-        here, there = here.told(told), there.told(told.transpose(1, 0, 2))
-        here, there = (one.carried(prior, STREET, 10**8) for one in (here, there))
-        stamp_ns = int(rng.integers(10**8, 10**9))
-        here, there = (one.looked("camera", answer, stamp_ns, STREET) for one in (here, there))
-    np.testing.assert_allclose(here.weights, there.weights.transpose(1, 0, 2), atol=1e-12)
 
 
 def read_often(looks_ns: list[int], street: StreetModel, miss: float = 0.05) -> JointBelief:
@@ -235,9 +212,8 @@ def test_looks_within_one_correlation_time_count_as_one(count: int, miss: float)
 
 
 def test_a_second_of_empty_looks_excludes_a_visible_vehicle() -> None:
-    after = read_often([k * 10**8 for k in range(10)], CERTAIN)
+    after, within = (read_often([k * step_ns for k in range(10)], CERTAIN) for step_ns in (10**8, 10**7))
     assert 0.0001 <= after.in_view <= 0.0004
-    within = read_often([k * 10**7 for k in range(10)], CERTAIN)
     assert within.in_view == pytest.approx(0.8 * 0.05 / (0.8 * 0.05 + 0.2), rel=1e-6)
 
 

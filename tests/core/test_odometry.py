@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from street_measurements import after, car, diagonal, hop, reading
 
-from worldstate import Context, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate import Context, Measurement, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
-from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
-from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.camera.detections import read_any_detections
 from worldstate.adapters.files.odometry_file import OdometryRecord, read_odometry
 from worldstate.belief.association import reached_edge
@@ -32,27 +31,26 @@ from worldstate.state.context import corner_at, open_side
 
 CORNERS = Context(occluders=(corner_at("left", (8.0, 3.0), 12.0), corner_at("right", (8.0, -4.0), 12.0)))
 OPEN = Context(occluders=(open_side("left", 1), open_side("right", -1)))
-_TWISTS = st.lists(st.tuples(st.floats(-5.0, 15.0), st.floats(-1.0, 1.0)), min_size=1, max_size=8)
+TWISTS = st.lists(st.tuples(st.floats(-5.0, 15.0), st.floats(-1.0, 1.0)), min_size=1, max_size=8)
 
 
-def heard(time_s: float, left: float = 4.0) -> Measurement:
-    """Return evidence of a hidden vehicle on the left and an empty look."""
-    said = SignatureEvidence(("left", "right"), (left, 0.0), 2.0 if left else 0.0, 0.0)
-    nothing = NotUsable("not measured")
-    return Measurement(round(time_s * 1e9), said, Absent(0.04), nothing, nothing)
+def heard(time_s: float, left: float = 4.0, *boxes, **parts) -> Measurement:
+    """Return evidence of a hidden vehicle on the left and a look."""
+    answer = Present(0.04) if boxes else Absent(0.04)
+    return hop(10 * time_s, (left, 0.0, 2.0, 0.0), *boxes, answer=answer, **parts)
 
 
 def odometry(time_s: float, speed_mps: float, yaw_rate: float = 0.0, pose: EgoPose | None = None) -> Odometry:
     return Odometry("wheels", round(time_s * 1e9), speed_mps, yaw_rate, pose=pose)
 
 
-@given(_TWISTS)
+@given(TWISTS)
 def test_a_standing_object_moves_with_the_inverse_pose(twists: list[tuple[float, float]]) -> None:
-    stands = Position((20.0, 5.0), tuple(map(tuple, np.diag([1e-3] * 4).tolist())), (0.0, 0.0), 0.99)
-    world = WorldFilter().update(PositionScan("v2x", 0, (stands,)))
+    stands = Position((20.0, 5.0), diagonal(*[1e-3**0.5] * 4), (0.0, 0.0), 0.99)
+    world = after(PositionScan("v2x", 0, (stands,)))
     pose = gtsam.Pose2(0.0, 0.0, 0.0)
-    for hop, (speed, rate) in enumerate(twists):
-        world = world.update(odometry(0.1 * hop, speed, rate)).predict(0.1)
+    for at, (speed, rate) in enumerate(twists):
+        world = world.update(odometry(0.1 * at, speed, rate)).predict(0.1)
         pose = pose.compose(gtsam.Pose2.Expmap(np.array([speed * 0.1, 0.0, rate * 0.1])))
     ego, place = world.state.ego, world.memory.tracks.place(0)
     assert ego is not None and place is not None
@@ -131,38 +129,27 @@ def test_a_rotated_ego_vehicle_has_the_rotated_site(yaw_rad: float) -> None:
 @pytest.mark.parametrize("context", [CORNERS, OPEN])
 def test_no_vehicle_is_hidden_without_an_occluder(context: Context, sequence: bool) -> None:
     """Past both corners or on an open road, whatever the evidence and the priors are."""
-    groups, even = np.full((2, len(GROUPS)), 1e-3), np.full(len(GROUPS), 1.0 / len(GROUPS))
-    groups[[0, 1], [GROUPS.index("coming_1s"), GROUPS.index("other")]] = 1.0
-    told = SequenceReading(groups / groups.sum(axis=1, keepdims=True), even, 0.1, SequenceAlarm(0.0, 20.0))
-
-    def hop(number: int, *boxes: Sighting) -> Measurement:
-        one = replace(heard(0.1 * number, 8.0), sequence=told if sequence else None, sightings=boxes)
-        return replace(one, co_evidence=Present(0.04)) if boxes else one
-
-    behind, world = WorldFilter(CORNERS), WorldFilter(context)
-    for number in range(1, 15):
-        behind = behind.update(hop(number))
+    told = reading({"coming_1s": (1.0, 1e-3), "other": (1e-3, 1.0)}) if sequence else None
+    behind = after(*(heard(0.1 * at, 8.0, sequence=told) for at in range(1, 15)), world=WorldFilter(CORNERS))
     assert behind.state.entities and behind.state.cues[0].advisory is not None
+    world = WorldFilter(context)
     assert (world.belief.risk < 1e-6) == (context is OPEN)
     if context is CORNERS:
         world = behind.update(odometry(1.5, 0.0, pose=EgoPose((9.0, 0.0))))
     edge_rad = world.state.context.occluders[0].edge_azimuth_rad
-    for number in range(16, 36):
-        boxes = [Sighting(edge_rad - 0.02 * (number - 20), 0.02, "car", 0.9)] * (20 <= number < 24)
-        world = world.update(hop(number, *boxes))
+    for at in range(16, 36):
+        boxes = [car(edge_rad - 0.02 * (at - 20))] * (20 <= at < 24)
+        world = world.update(heard(0.1 * at, 8.0, *boxes, sequence=told))
         assert world.belief.risk < 1e-6 and not any(cue.advisory for cue in world.state.cues)
         assert not any(one.status == "hidden" for one in world.state.entities)
     assert not any(one.hides for one in world.state.context.occluders)
 
 
 def test_odometry_may_be_late_and_survives_a_checkpoint() -> None:
-    told = [heard(0.1 * hop) for hop in range(1, 12)]
-    told += [odometry(0.1 * hop + 0.02, 4.0, 0.05 * hop) for hop in range(11)]
-    in_order, late = WorldFilter(CORNERS), WorldFilter(CORNERS)
-    for one in sorted(told, key=lambda one: one.stamp_ns):
-        in_order = in_order.update(one)
-    for one in told:
-        late = late.update(one)
+    told = [heard(0.1 * at) for at in range(1, 12)]
+    told += [odometry(0.1 * at + 0.02, 4.0, 0.05 * at) for at in range(11)]
+    in_order = after(*sorted(told, key=lambda one: one.stamp_ns), world=WorldFilter(CORNERS))
+    late = after(*told, world=WorldFilter(CORNERS))
     late = late.predict_to(in_order.stamp_ns)
     assert late.state.entities == in_order.state.entities and late.state.ego == in_order.state.ego
     kept = WorldFilter.from_dict(in_order.to_dict())
@@ -178,22 +165,31 @@ def test_a_message_from_an_open_road_is_not_hidden() -> None:
         assert entity.status == status
 
 
-def test_odometry_csv_is_read_and_errors_have_the_line(tmp_path) -> None:
+def test_odometry_csv_is_read_with_empty_poses(tmp_path) -> None:
     path = tmp_path / "ego.csv"
-    path.write_text("time_s,speed_mps,yaw_rate_rad_s,x_m,y_m,yaw_rad\n0,5,0.1,2,1,0.3\n0.1,5.5,0,2.5,1,0.3\n")
+    path.write_text("time_s,speed_mps,yaw_rate_rad_s,x_m,y_m,yaw_rad\n0,5,0.1,2,1,0.3\n0.1,5.5,0,,,\n")
     log = read_odometry(path)
     assert log.told[0] == Odometry("odometry", 0, 5.0, 0.1, pose=EgoPose((2.0, 1.0), 0.3))
-    assert log.moves and log.told[1].stamp_ns == 100_000_000
-    for text, words in (
-        ("time_s,speed_mps\n0,fast\n", "line 2: expected a finite number as speed_mps"),
-        ("time_s,speed_mps\n0,500\n", "line 2: speed_mps: expected a number in"),
-        ("time_s,speed_mps\n", "at least one line"),
-        ("time_s,speed_mps,x_m\n1,5,0\n", "expected x_m, y_m and yaw_rad together"),
-        ("time_s,speed_mps\n1e308,5\n", r"line 2: time: expected nanoseconds of 64 bits, got 1e\+308 s"),
-    ):
-        path.write_text(text)
-        with pytest.raises(InputFileError, match=words):
-            read_odometry(path)
+    assert log.moves and log.told[1] == Odometry("odometry", 100_000_000, 5.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("\n0,fast\n", "line 2: expected a finite number as speed_mps"),
+        ("\n0,\n", "line 2: expected a finite number as speed_mps"),
+        ("\n0,500\n", "line 2: speed_mps: expected a number in"),
+        ("\n", "at least one line"),
+        (",x_m\n1,5,0\n", "expected x_m, y_m and yaw_rad together"),
+        (",x_m,y_m,yaw_rad\n0,5,1e9,0,0\n", "line 2: x_m: expected a number in"),
+        ("\n1e308,5\n", r"line 2: time: expected nanoseconds of 64 bits, got 1e\+308 s"),
+    ],
+)
+def test_errors_of_an_odometry_csv_have_the_line(tmp_path, text: str, words: str) -> None:
+    path = tmp_path / "ego.csv"
+    path.write_text("time_s,speed_mps" + text)
+    with pytest.raises(InputFileError, match=words):
+        read_odometry(path)
 
 
 def test_a_run_with_odometry_drives_up_to_the_corner(approach, tmp_path) -> None:
@@ -204,17 +200,9 @@ def test_a_run_with_odometry_drives_up_to_the_corner(approach, tmp_path) -> None
     ]
     context.write_text(json.dumps({"arms": arms}))
     ego.write_text("time_s,speed_mps\n" + "".join(f"{0.1 * k:.1f},1.5\n" for k in range(100)))
-    command = [
-        "run",
-        str(approach.folder),
-        "--context",
-        str(context),
-        "--odometry",
-        str(ego),
-        "--out",
-        str(out),
-    ]
-    assert main(command) == 0
+    files = {"--context": context, "--odometry": ego, "--out": out}
+    options = (str(one) for pair in files.items() for one in pair)
+    assert main(["run", str(approach.folder), *options]) == 0
     states = [json.loads(line) for line in out.read_text().splitlines()]
     for state in (states[0], states[-1]):
         x = 1.5 * state["stamp_ns"] * 1e-9
@@ -236,18 +224,6 @@ def test_an_unwrapped_yaw_of_a_localiser_is_wrapped(turns, yaw_rad, told_as, tmp
         told = OdometryRecord(5.0, 0.0, 5.4e6, 6.9e5, counted).at(0)  # UTM
     assert told.speed_mps == 5.0 and told.pose is not None
     assert told.pose.yaw_rad == pytest.approx(yaw_rad, abs=1e-9)
-
-
-def test_empty_cells_of_a_pose_are_allowed(tmp_path) -> None:
-    path = tmp_path / "ego.csv"
-    path.write_text("time_s,speed_mps,x_m,y_m,yaw_rad\n0,5,,,\n0.1,5,1,2,3\n")
-    assert [one.pose is None for one in read_odometry(path).told] == [True, False]
-    path.write_text("time_s,speed_mps,x_m,y_m,yaw_rad\n0,5,1e9,0,0\n")
-    with pytest.raises(InputFileError, match="line 2: x_m: expected a number in"):
-        read_odometry(path)
-    path.write_text("time_s,speed_mps\n0,\n")
-    with pytest.raises(InputFileError, match="line 2: expected a finite number as speed_mps"):
-        read_odometry(path)
 
 
 @pytest.mark.slow

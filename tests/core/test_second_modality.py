@@ -6,17 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from street_measurements import hop
 
-from worldstate import (
-    Absent,
-    Measurement,
-    NotUsable,
-    Present,
-    SignatureEvidence,
-    Unqueried,
-    WorldFilter,
-    nanoseconds,
-)
+from worldstate import Absent, Present, Unqueried, WorldFilter, nanoseconds
 from worldstate.belief.street_model import StreetModel
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "v2x_beacon.py"
@@ -72,9 +64,7 @@ def test_a_forged_visible_beacon_is_refuted_by_the_camera(v2x):
 
 
 def test_a_beacon_of_implausible_power_makes_no_entity(v2x):
-    far_too_weak = [
-        replace(beacon, power_dbm=beacon.power_dbm - 30.0) for beacon in v2x.approach_from_left(3.0)
-    ]
+    far_too_weak = [replace(one, power_dbm=one.power_dbm - 30.0) for one in v2x.approach_from_left(3.0)]
     state = last(v2x.run(far_too_weak, v2x.ScriptedCamera([], t0_s=0.0)))
     assert state.cues[0].hypotheses.none > 0.9
     assert state.entities == ()
@@ -107,8 +97,7 @@ def test_beacons_and_sound_share_one_filter(v2x):
     doubtful = v2x.RadioSignature(loss_std_db=12.0)
     beacons = v2x.approach_from_left(2.0)
     radio = v2x.BeaconAdapter(doubtful).measure(beacons)
-    faint = SignatureEvidence(("left", "right"), (0.5, -0.5), 0.0, 0.3)
-    sound = [Measurement(m.stamp_ns, faint, Unqueried("-"), NotUsable("-"), NotUsable("-")) for m in radio]
+    sound = [hop(m.stamp_ns / 1e8, (0.5, -0.5, 0.0, 0.3)) for m in radio]
 
     def heard(measurements):
         world = WorldFilter(settings=v2x.SETTINGS)

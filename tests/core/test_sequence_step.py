@@ -1,7 +1,6 @@
 """Sequence readings in the filter: laws, alarm and snapshot."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, astuple, replace
 
 import numpy as np
@@ -9,12 +8,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import gamma
+from street_measurements import (
+    ABSENT,
+    COMING,
+    PRESENT,
+    SEEDS,
+    SILENT,
+    UNASKED,
+    after,
+    car,
+    drawn_groups,
+    hop,
+    reading,
+    run,
+)
 
-from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate import Context, Measurement, WorldFilter, WorldState
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
-from worldstate.abduction.evidence import SignatureEvidence
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm, SequencePosterior
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel
@@ -25,39 +37,30 @@ from worldstate.core.site_model import site_geometry_of
 from worldstate.core.step import _announced_in_view
 from worldstate.core.street_belief import ArrivalRate
 from worldstate.ground.values import NotUsable
-from worldstate.measurement import Bearing, Look
+from worldstate.measurement import Bearing
 from worldstate.state import Priors, blind_corner
 
-SEEDS = st.integers(0, 2**32 - 1)
-NOBODY = SignatureEvidence(("left", "right"), (-1.0, -1.0), -1.0, 1.0)
-SILENT = NotUsable("not scripted")
-UNASKED = Unqueried("no camera")
-COMING = len(COMING_S)
+NOBODY, SURE = (-1.0, -1.0, -1.0, 1.0), (9.0, 0.0, -1.0, -1.0)
 # A reading takes effect at once, and every camera works.
 WHOLE = StreetModel(reading_s=1e-3, reading_gain=1.0, works=1.0)
 EXACT, STREET = FilterSettings(street=WHOLE), StreetModel()
 
 
-# One share for all tests, because a chain is computed once per share.
-SHARE = 0.9 * np.random.default_rng(0).dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
+Said = SequenceReading | NotUsable | None
 
 
-def drawn(rng: np.random.Generator, hops: int, alarm: SequenceAlarm | None = None) -> list[SequenceReading]:
-    groups = 0.999 * rng.dirichlet(np.full(len(GROUPS), 0.2), (hops, 2)) + 0.001 / len(GROUPS)
-    return [SequenceReading(one, SHARE, 0.1, alarm) for one in groups]
+def drawn(rng: np.random.Generator, hops: int, threshold: float | None = None) -> list[SequenceReading]:
+    return [reading(one, threshold) for one in drawn_groups(rng, hops, 2)]
 
 
-def heard(
-    hop: float,
-    said: SequenceReading | NotUsable | None,
-    answer: CoEvidence = UNASKED,
-    source: str = "acoustic",
-) -> Measurement:
-    return Measurement(*(round(hop * 1e8), NOBODY, answer, SILENT, SILENT), source=source, sequence=said)
+def heard(number: float, said: Said, answer: CoEvidence = UNASKED) -> Measurement:
+    return hop(number, NOBODY, answer=answer, sequence=said)
 
 
-def run(world: WorldFilter, measured: Sequence[Measurement]) -> list[WorldFilter]:
-    return [world := world.update(one) for one in measured]
+def all_heard(said: list[Said], answers: list[CoEvidence] | None = None, first: int = 1) -> list[Measurement]:
+    """Return a measurement per reading, in consecutive hops."""
+    numbers = range(first, first + len(said))
+    return list(map(heard, numbers, said, answers or [UNASKED] * len(said)))
 
 
 def belief(world: WorldFilter) -> np.ndarray:
@@ -66,7 +69,7 @@ def belief(world: WorldFilter) -> np.ndarray:
 
 
 def looks(rng: np.random.Generator, hops: int) -> list[CoEvidence]:
-    answers = [Absent(0.04, 0.01), Present(0.04, 0.01), UNASKED]
+    answers = [ABSENT, PRESENT, UNASKED]
     return [answers[one] for one in rng.integers(0, 3, hops)]
 
 
@@ -75,8 +78,8 @@ def looks(rng: np.random.Generator, hops: int) -> list[CoEvidence]:
 def test_a_sequence_alone_determines_the_belief(seed: int) -> None:
     rng = np.random.default_rng(seed)
     said = drawn(rng, 12)
-    hop = np.cumsum(rng.integers(1, 21, 12))  # A longer pause needs a second measurement
-    worlds = run(WorldFilter(settings=EXACT), [heard(at, one) for at, one in zip(hop, said, strict=True)])
+    numbers = np.cumsum(rng.integers(1, 21, 12))  # A longer pause needs a second measurement
+    worlds = run(WorldFilter(settings=EXACT), map(heard, numbers, said))
     for world, one in zip(worlds, said, strict=True):
         comes = one.groups[:, :COMING]
         np.testing.assert_allclose(belief(world)[:, :COMING], comes, rtol=1e-6, atol=1e-9)
@@ -86,15 +89,10 @@ def test_a_sequence_alone_determines_the_belief(seed: int) -> None:
 
 
 def test_the_less_likely_side_is_advised_only_with_two_vehicles() -> None:
-    alarm = SequenceAlarm(-2.0, 20.0)
-
     def told(alone: float) -> list[str]:
         """Return the sides of the advisories; `alone` is P(coming on the other side only)."""
-        groups = np.full((2, len(GROUPS)), 1e-3)
-        groups[:, GROUPS.index("coming_2s")] = 0.5, 0.45
-        groups[:, GROUPS.index("other")] = alone
-        said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, alarm)
-        state = run(WorldFilter(), [heard(hop, said) for hop in range(8)])[-1].state
+        said = reading({"coming_2s": (0.5, 0.45), "other": alone}, -2.0)
+        state = after(*all_heard([said] * 8)).state
         return [cue.direction for cue in state.cues if cue.advisory is not None]
 
     assert told(alone=0.48) == ["left"]
@@ -106,7 +104,7 @@ def test_the_less_likely_side_is_advised_only_with_two_vehicles() -> None:
 def test_a_context_moves_the_odds_of_a_reading_within_limits(seed: int, hidden: float) -> None:
     said = drawn(np.random.default_rng(seed), 1)[0]
     context = Context(priors=Priors(hidden, 0.0, 1.0 - hidden))
-    moved = belief(run(WorldFilter(context, settings=EXACT), [heard(1, said)])[0])
+    moved = belief(WorldFilter(context, settings=EXACT).update(heard(1, said)))
     coming = [one[:, :COMING].sum(axis=1) for one in (moved, said.groups)]
     shift = np.subtract(*(np.log(one) - np.log1p(-one) for one in coming))
     assert (shift > -0.5 - 1e-6).all() and (shift < 2.0 + 1e-6).all()
@@ -114,30 +112,14 @@ def test_a_context_moves_the_odds_of_a_reading_within_limits(seed: int, hidden: 
 
 
 @given(SEEDS)
-@settings(max_examples=3)
-def test_the_mirrored_world_has_the_mirrored_belief(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    said, seen = drawn(rng, 15, SequenceAlarm(0.0, 15.0)), looks(rng, 15)
-    here = [heard(hop, one, look) for hop, (one, look) in enumerate(zip(said, seen, strict=True), 1)]
-    there = [replace(one, sequence=replace(one.sequence, groups=one.sequence.groups[::-1])) for one in here]
-    for one, other in zip(run(WorldFilter(), here), run(WorldFilter(), there), strict=True):
-        np.testing.assert_allclose(belief(one), belief(other)[::-1], atol=1e-9)
-        cues = {cue.direction: cue for cue in other.state.cues}
-        for cue in one.state.cues:
-            mirrored = cues["right" if cue.direction == "left" else "left"]
-            assert (cue.advisory, cue.within) == (mirrored.advisory, pytest.approx(mirrored.within, abs=1e-9))
-            assert cue.time_to_visible_s == pytest.approx(mirrored.time_to_visible_s, abs=1e-6)
-
-
-@given(SEEDS)
 @settings(max_examples=2)
 def test_the_order_of_a_contexts_sides_does_not_matter(seed: int) -> None:
     """Sides are matched by name."""
     rng = np.random.default_rng(seed)
-    said, seen = drawn(rng, 10, SequenceAlarm(0.0, 15.0)), looks(rng, 10)
+    said, seen = drawn(rng, 10, 0.0), looks(rng, 10)
     turned = Context(occluders=(blind_corner("right", -1), blind_corner("left", 1)))
-    measured = [heard(hop, one, look) for hop, (one, look) in enumerate(zip(said, seen, strict=True), 1)]
-    for one, other in zip(run(WorldFilter(), measured), run(WorldFilter(turned), measured), strict=True):
+    worlds = (run(WorldFilter(context), all_heard(said, seen)) for context in (Context(), turned))
+    for one, other in zip(*worlds, strict=True):
         np.testing.assert_allclose(belief(one), belief(other)[::-1], atol=1e-9)
         pairs = zip(one.state.cues, other.state.cues, strict=True)
         assert all((a.direction, a.advisory) == (b.direction, b.advisory) for a, b in pairs)
@@ -148,8 +130,7 @@ def test_the_order_of_a_contexts_sides_does_not_matter(seed: int) -> None:
 def test_predictions_compose_and_end_at_the_stationary_share(seed: int, one: int, two: int) -> None:
     rng = np.random.default_rng(seed)
     said = drawn(rng, 3)
-    measured = [heard(hop, reading, Absent(0.04, 0.01)) for hop, reading in enumerate(said, 1)]
-    world = run(WorldFilter(), measured)[-1]
+    world = after(*all_heard(said, [ABSENT] * 3))
     parts, whole = world.predict(one / 100).predict(two / 100), world.predict((one + two) / 100)
     np.testing.assert_allclose(belief(parts), belief(whole), atol=1e-9)
     later = belief(world.predict(1000.0))
@@ -161,8 +142,8 @@ def test_predictions_compose_and_end_at_the_stationary_share(seed: int, one: int
 def test_sources_with_equal_stamps_commute(seed: int) -> None:
     rng = np.random.default_rng(seed)
     before, now = drawn(rng, 2)
-    world = run(WorldFilter(), [heard(1, before, Present(0.04, 0.01))])[0]
-    pair = [heard(2, now), heard(2, None, Absent(0.04, 0.01), source="camera")]
+    world = run(WorldFilter(), [heard(1, before, PRESENT)])[0]
+    pair = [heard(2, now), replace(heard(2, None, ABSENT), source="camera")]
     one, other = run(world, pair)[-1], run(world, pair[::-1])[-1]
     np.testing.assert_allclose(belief(one), belief(other), atol=1e-12)
 
@@ -170,8 +151,8 @@ def test_sources_with_equal_stamps_commute(seed: int) -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_alarm_equals_that_of_the_stream_of_beliefs(seed: int) -> None:
     r"""The mean of three hops; the less likely side has at most gamma + log P(here) / P(only elsewhere)."""
-    said = drawn(np.random.default_rng(seed), 40, SequenceAlarm(0.5, 15.0))
-    worlds = run(WorldFilter(settings=EXACT), [heard(hop, one) for hop, one in enumerate(said, 1)])
+    said = drawn(np.random.default_rng(seed), 40, 0.5)
+    worlds = run(WorldFilter(settings=EXACT), all_heard(said))
     decided = smoothed_log_odds(SequencePosterior(np.stack([belief(world) for world in worlds]), 0.1))
     for row, world in zip(decided, worlds, strict=True):
         here, less = belief(world).sum(axis=1), int(np.argmin(row))
@@ -185,25 +166,22 @@ def test_the_alarm_equals_that_of_the_stream_of_beliefs(seed: int) -> None:
     one_alone = [world.memory.belief.both_come <= 0.5 for world in worlds]
     for side in (0, 1):
         last = -np.inf
-        for hop in range(40):
-            elsewhere = over[hop, 1 - side] and not over[hop, side] and one_alone[hop]
-            last = -np.inf if elsewhere or not likely[hop, side] else hop if over[hop, side] else last
-            assert hop < 13 or raised[hop][side] == (hop - last <= 10)
+        for at in range(40):
+            elsewhere = over[at, 1 - side] and not over[at, side] and one_alone[at]
+            last = -np.inf if elsewhere or not likely[at, side] else at if over[at, side] else last
+            assert at < 13 or raised[at][side] == (at - last <= 10)
     assert all(cue.alpha is None for cue in worlds[-1].state.cues)
 
 
 def test_the_alarm_is_held_for_a_second_at_any_hop() -> None:
-    said = drawn(np.random.default_rng(3), 1, SequenceAlarm(2.0, 15.0))[0]
-    chances = np.full((2, 2, len(GROUPS)), 1e-6)
-    chances[0, 0, 0], chances[0, 1, -1], chances[1, :, -1] = 1.0, 1.0, 1.0
-    chances[1, :, COMING - 1] = 0.2  # Late, but likely enough to hold the advisory
-    chances /= chances.sum(axis=-1, keepdims=True)
-    coming, over = (replace(said, groups=one) for one in chances)
-    world = run(WorldFilter(settings=EXACT), [heard(hop, coming) for hop in range(1, 5)])[-1]
+    coming = reading({GROUPS[0]: (1.0, 1e-6), GROUPS[-1]: (1e-6, 1.0)}, 2.0, rest=1e-6)
+    # Late, but likely enough to hold the advisory
+    over = reading({"coming_8s": 0.2, GROUPS[-1]: 1.0}, 2.0, rest=1e-6)
+    world = after(*all_heard([coming] * 4), world=WorldFilter(settings=EXACT))
     for step in (0.5, 1.0, 2.0):
         hops = np.arange(5, 20, step)
-        states = [one.state for one in run(world, [heard(hop, over) for hop in hops])]
-        named = [[cue.direction for cue in state.cues if cue.advisory] for state in states]
+        later = run(world, [heard(number, over) for number in hops])
+        named = [[cue.direction for cue in one.state.cues if cue.advisory] for one in later]
         off = hops[named.index([])]
         # The mean over 0.3 s falls below the threshold at once if a step spans several hops.
         assert {tuple(one) for one in named} == {("left",), ()} and 14 <= off <= 17
@@ -212,31 +190,26 @@ def test_the_alarm_is_held_for_a_second_at_any_hop() -> None:
 
 def test_one_vehicle_is_advised_on_one_side() -> None:
     """In twenty demos a sixth of the advisory hops are on the wrong side (was a quarter)."""
-    said = drawn(np.random.default_rng(3), 1, SequenceAlarm(-0.5, 15.0))[0]
-    chances = np.full((2, len(GROUPS)), 1e-4)
-    chances[:, 0], chances[:, -1] = (0.75, 0.2), (0.25, 0.8)
-    chances /= chances.sum(axis=1, keepdims=True)
-    right, left = (replace(said, groups=one) for one in (chances[::-1], chances))
-    worlds = run(WorldFilter(settings=EXACT), [heard(hop, right if hop < 6 else left) for hop in range(12)])
+    left = reading({GROUPS[0]: (0.75, 0.2), GROUPS[-1]: (0.25, 0.8)}, -0.5, rest=1e-4)
+    right = replace(left, groups=left.groups[::-1])
+    worlds = run(WorldFilter(settings=EXACT), all_heard([right] * 6 + [left] * 6, first=0))
     named = [tuple(cue.direction for cue in world.state.cues if cue.advisory) for world in worlds]
     assert named[5] == ("right",) and named[-1] == ("left",)
     assert ("left", "right") not in named
 
 
 def test_a_hand_over_resets_the_alarm_of_its_side() -> None:
-    groups = np.full((2, len(GROUPS)), 1e-3)
-    groups[:, GROUPS.index("coming_2s")] = 1.0
-    said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, SequenceAlarm(-2.0, 20.0))
-    sequence = run(WorldFilter(), [heard(hop, said) for hop in range(8)])[-1].memory.belief
-    after = sequence.handed_over({0: 0.02}, (), sequence.stamp_ns, WHOLE)
-    assert min(sequence.decided) > -2.0 and after.decided[0] <= -20.0
-    assert after.decided[1] == sequence.decided[1] and after.over_ns == (None, sequence.over_ns[1])
+    said = reading({"coming_2s": 1.0}, -2.0)
+    sequence = after(*all_heard([said] * 8)).memory.belief
+    other = sequence.handed_over({0: 0.02}, (), sequence.stamp_ns, WHOLE)
+    assert min(sequence.decided) > -2.0 and other.decided[0] <= -20.0
+    assert other.decided[1] == sequence.decided[1] and other.over_ns == (None, sequence.over_ns[1])
 
 
 def test_the_threshold_is_higher_for_five_seconds_after_a_hand_over() -> None:
     """The sound after a pass resembles another vehicle; half of the single vehicles were announced twice."""
-    said = drawn(np.random.default_rng(5), 1, SequenceAlarm(-0.8, 20.0))[0]
-    sequence = run(WorldFilter(), [heard(hop, said) for hop in range(8)])[-1].memory.belief
+    said = drawn(np.random.default_rng(5), 1, -0.8)[0]
+    sequence = after(*all_heard([said] * 8)).memory.belief
     beside = sequence.handed_over({0: 0.02}, (), sequence.stamp_ns, WHOLE)
     stood = [replace(beside, stamp_ns=beside.stamp_ns + after_ns) for after_ns in (0, 49 * 10**8, 51 * 10**8)]
     thresholds = [one.threshold_nats(uncalibrated_policy(), WHOLE) for one in (sequence, *stood)]
@@ -246,22 +219,20 @@ def test_the_threshold_is_higher_for_five_seconds_after_a_hand_over() -> None:
 def test_an_announced_vehicle_may_emerge_on_either_side() -> None:
     context = Context()
     hidden = born("left", 0, 0.9, 0, site_geometry_of(context, FilterSettings()))
-    before, after = (first_memory(context, FilterSettings(), 0) for _ in range(2))
-    before.tracks = Tracks.of([hidden])
-    for other in (hidden, replace(hidden, id="another", seen=True)):
-        after.tracks = Tracks.of([other])
-        assert _announced_in_view(before, after) == []
-    after.tracks = Tracks.of([replace(hidden, seen=True, side=1)])
-    assert _announced_in_view(before, after) == [0]
+    before, now = (first_memory(context, FilterSettings(), 0) for _ in range(2))
+    before.tracks, seen = Tracks.of([hidden]), replace(hidden, seen=True)
+    for track, sides in ((hidden, []), (replace(seen, id="another"), []), (replace(seen, side=1), [0])):
+        now.tracks = Tracks.of([track])
+        assert _announced_in_view(before, now) == sides
 
 
 def test_more_looks_move_the_visible_hypothesis_further() -> None:
-    said = replace(drawn(np.random.default_rng(1), 1)[0], groups=np.full((2, len(GROUPS)), 1 / len(GROUPS)))
+    said = reading({}, None)
 
     def in_view(answer: CoEvidence, since: int) -> float:
         """Return P(in view) after a second of sound, with looks since a hop."""
-        hops = [heard(hop, said, answer if hop >= since else UNASKED) for hop in range(1, 11)]
-        return run(WorldFilter(), hops)[-1].memory.belief.in_view
+        answers = [UNASKED] * (since - 1) + [answer] * (11 - since)
+        return after(*all_heard([said] * 10, answers)).memory.belief.joint.in_view
 
     # One look, and looks for 0.5 s and 1 s.
     seen, empty = ([in_view(kind(0.3, 0.05), since) for since in (10, 6, 1)] for kind in (Present, Absent))
@@ -275,19 +246,16 @@ def test_a_repeated_look_counts_once(seed: int) -> None:
     """The sound delivers an image twice, and a second source delivers it again."""
     rng = np.random.default_rng(seed)
     said, seen = drawn(rng, 12), looks(rng, 12)
-    car = Sighting(0.4, 0.02, "car", 0.9)
-    worlds = [WorldFilter(), WorldFilter()]
-    for hop, (reading, answer) in enumerate(zip(said, seen, strict=True), 1):
-        look = None if isinstance(answer, Unqueried) else Look("camera", hop * 10**8, answer)
-        sightings = (car,) if isinstance(answer, Present) else ()
-        first = replace(heard(hop, reading, answer), look=look, sightings=sightings)
-        dumb = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
-        second = replace(first, stamp_ns=first.stamp_ns + 10**7, sequence=None, signature=dumb, source="v2x")
-        bare = replace(second, look=None, sightings=(), co_evidence=UNASKED)
-        carried = [first, first, second] if look is not None else [first, first, bare]
-        for number, every in enumerate((carried, [first, bare])):
-            for one in every:
-                worlds[number] = worlds[number].update(one)
+    every = [[], []]
+    for number, (one, answer) in enumerate(zip(said, seen, strict=True), 1):
+        boxes = [car(0.4)] * isinstance(answer, Present)
+        first = hop(number, NOBODY, *boxes, answer=answer, sequence=one)
+        first = replace(first, look=None if answer is UNASKED else first.looks[0].look)
+        bare = hop(number + 0.1, source="v2x")
+        second = replace(bare, look=first.look, sightings=first.sightings, co_evidence=answer)
+        every[0] += [first, first, second if first.look else bare]
+        every[1] += [first, bare]
+    worlds = [after(*told) for told in every]
     many, once = (world.state for world in worlds)
     assert [one.id for one in many.entities] == [one.id for one in once.entities]
     for one, other in zip(many.entities, once.entities, strict=True):
@@ -305,25 +273,22 @@ def test_vehicles_of_both_sides_are_independent(seed: int) -> None:
     coming = np.concatenate([rng.dirichlet(np.ones(COMING)) * 0.9, np.full(len(GROUPS) - COMING, 0.1 / 6)])
     nobody = np.concatenate([np.full(COMING, 0.01 / 9), np.full(len(GROUPS) - COMING, 0.99 / 6)])
     alone, both = (
-        run(
-            WorldFilter(settings=EXACT),
-            [heard(hop, SequenceReading(np.stack([coming, one]), SHARE)) for hop in range(1, 5)],
-        )
+        after(*all_heard([reading(np.stack([coming, one]), None)] * 4), world=WorldFilter(settings=EXACT))
         for one in (nobody, coming)
     )
-    left = {one.direction: one for one in alone[-1].state.entities}
-    sides = {one.direction: one for one in both[-1].state.entities}
+    left = {one.direction: one for one in alone.state.entities}
+    sides = {one.direction: one for one in both.state.entities}
     assert (set(left), set(sides)) == ({"left"}, {"left", "right"})
     # The difference is the probability of an unseen emergence.
     assert sides["left"].hidden_probability == pytest.approx(left["left"].hidden_probability, abs=2e-3)
     assert sides["left"].azimuth_rad == pytest.approx(-sides["right"].azimuth_rad)
-    assert both[-1].belief.hidden[0] == pytest.approx(0.9, abs=1e-6)
+    assert both.belief.hidden[0] == pytest.approx(0.9, abs=1e-6)
 
 
 def test_without_a_sequence_there_are_no_times() -> None:
-    alone = run(WorldFilter(), [heard(hop, None) for hop in range(1, 5)])[-1].state
+    alone = after(*all_heard([None] * 4)).state
     refused = NotUsable("the model was made for a standing ego, this one moves")
-    silent = run(WorldFilter(), [heard(hop, refused) for hop in range(1, 5)])[-1].state
+    silent = after(*all_heard([refused] * 4)).state
     assert {(cue.within, cue.time_to_visible_s) for cue in alone.cues} == {(None, None)}
     assert (alone.no_sequence, silent.no_sequence) == (None, refused)
     assert WorldState.from_json(silent.to_json()) == silent
@@ -331,11 +296,8 @@ def test_without_a_sequence_there_are_no_times() -> None:
 
 
 def test_the_snapshot_has_times_for_an_expected_vehicle() -> None:
-    said = drawn(np.random.default_rng(2), 1)[0]
-    groups = np.full((2, len(GROUPS)), 1e-3)
-    groups[0, GROUPS.index("coming_1.5s")], groups[1, -1] = 1.0, 1.0
-    said = replace(said, groups=groups / groups.sum(axis=1, keepdims=True))
-    state = run(WorldFilter(), [heard(1, said)])[0].state
+    said = reading({"coming_1.5s": (1.0, 1e-3), GROUPS[-1]: (1e-3, 1.0)})
+    state = after(heard(1, said)).state
     left, right = state.cues
     assert left.time_to_visible_s is not None and right.time_to_visible_s is None
     low, best, high = left.time_to_visible_s
@@ -350,26 +312,23 @@ def approach(in_view: float = 0.98) -> list[SequenceReading]:
 
     `in_view` is P(visible) in the last readings; the rest is none.
     """
-    groups = np.full((50, 2, len(GROUPS)), 1e-5)
-    for hop in range(50):
-        sure = 0.98 if hop < 30 else in_view
-        left = min(max(int(np.searchsorted(COMING_S, 3.0 - 0.1 * hop)), 0), COMING) if hop < 30 else COMING
-        groups[hop, :, GROUPS.index("none")] = 1.0 - sure
-        groups[hop, 0, left] = sure
-        groups[hop, 1, COMING + 1 if hop < 30 else COMING] = sure
-    return [SequenceReading(one / one.sum(axis=1, keepdims=True), SHARE) for one in groups]
+    said = []
+    for number in range(50):
+        sure = 0.98 if number < 30 else in_view
+        groups = np.full((2, len(GROUPS)), 1e-5)
+        groups[:, GROUPS.index("none")] = 1.0 - sure
+        groups[0, np.searchsorted(COMING_S, 3.0 - 0.1 * number) if number < 30 else COMING] = sure
+        groups[1, COMING + (number < 30)] = sure
+        said.append(reading(groups, 0.0))
+    return said
 
 
 def passed_by(street: StreetModel) -> list[tuple[float, ...]]:
     """Return risks, hypotheses and thresholds while a vehicle comes, is detected and stays audible."""
     world, told = WorldFilter(settings=FilterSettings(street=street)), list[tuple[float, ...]]()
-    alarm = SequenceAlarm(0.0, 20.0)
-    for hop, said in enumerate(approach(in_view=0.8), 1):
-        answer = Present(0.04, 0.01) if hop in (31, 32) else Absent(0.04, 0.01)
-        boxes = (Sighting(0.53, 0.02, "car", 0.9),) if hop in (31, 32) else ()
-        look = Look("camera", hop * 10**8, answer)
-        one = replace(heard(hop, replace(said, alarm=alarm), answer), look=look, sightings=boxes)
-        world = world.update(one)
+    for number, said in enumerate(approach(in_view=0.8), 1):
+        boxes = [car(0.53)] * (number in (31, 32))
+        world = world.update(hop(number, NOBODY, *boxes, answer=PRESENT if boxes else ABSENT, sequence=said))
         cues = world.state.cues
         told += [(one.risk, *astuple(one.hypotheses), one.evidence.threshold_nats) for one in cues]
     return told
@@ -395,17 +354,16 @@ def test_evidence_is_ignored_for_1_5_s_after_a_hand_over(kind: str, seed: int) -
     rng, moved = np.random.default_rng(seed), list[bool]()
     said, nats = drawn(rng, 2), rng.uniform(-3.0, 3.0, (2, 4)).tolist()
 
-    def at(hop: int, k: int) -> Measurement:
-        one, (left, right, visible, none) = heard(hop, said[k] if kind == "sequence" else None), nats[k]
-        return replace(one, signature=SignatureEvidence(("left", "right"), (left, right), visible, none))
+    def at(number: float, k: int) -> Measurement:
+        return hop(number, nats[k], sequence=said[k] if kind == "sequence" else None)
 
     windows = FilterSettings(windows="likelihood" if kind == "likelihood" else "posterior")
-    before = run(WorldFilter(settings=windows), [at(hop, 0) for hop in range(8)])[-1]
+    before = after(*(at(number, 0) for number in range(8)), world=WorldFilter(settings=windows))
     kept = before.memory.belief.handed_over({0: 0.02}, (), before.stamp_ns, STREET)
     masked = replace(before, memory=replace(before.memory, belief=kept), lag=None)
     for after_s in (0.1, 1.2, 1.5):
-        hop = round(masked.stamp_ns * 1e-8 + 10 * after_s)
-        risks = [masked.update(at(hop, k)).belief.risks for k in (0, 1)]
+        number = masked.stamp_ns * 1e-8 + 10 * after_s
+        risks = [masked.update(at(number, k)).belief.risks for k in (0, 1)]
         moved.append(not np.allclose(*risks, atol=1e-9))
     assert moved == [False, False, True]
 
@@ -415,11 +373,9 @@ def test_an_unseen_emerged_vehicle_lasts_as_long_as_its_sound() -> None:
     said = approach(in_view=0.8)
 
     def beside(answer: CoEvidence) -> list[WorldFilter]:
-        looking = 30 * [UNASKED] + 20 * [answer]
-        told = enumerate(zip(said, looking, strict=True))
-        return run(WorldFilter(settings=EXACT), [heard(hop + 1, one, seen) for hop, (one, seen) in told])
+        return run(WorldFilter(settings=EXACT), all_heard(said, [UNASKED] * 30 + [answer] * 20))
 
-    dead, empty = beside(UNASKED), beside(Absent(0.04, 0.01))
+    dead, empty = beside(UNASKED), beside(ABSENT)
     (before,) = dead[28].state.entities
     assert before.status == "hidden" and before.existence_probability > 0.9
     for world in (*dead[30:], *beside(Absent(0.9, 0.01))[30:]):
@@ -440,11 +396,11 @@ def test_an_emerged_vehicle_of_unknown_side_counts_once() -> None:
     def in_view(chances: tuple[float, float]) -> tuple[float, float]:
         """Return P(in view, come from there) half a second after the vehicle came."""
         said = []
-        for hop, one in enumerate(approach()):
-            coming, away = one.groups if hop < 30 else one.groups[[0, 0]]
+        for number, one in enumerate(approach()):
+            coming, away = one.groups if number < 30 else one.groups[[0, 0]]
             mixed = [chance * coming + (1.0 - chance) * away for chance in chances]
             said.append(replace(one, groups=np.stack(mixed)))
-        world = run(WorldFilter(), [heard(hop + 1, one) for hop, one in enumerate(said)])[34]
+        world = run(WorldFilter(), all_heard(said))[34]
         low, high = sorted(world.belief.emerged)
         return low, high
 
@@ -469,15 +425,11 @@ def test_arrival_rates_are_a_gamma_posterior_with_a_limit(
 
 def test_an_empty_street_lowers_the_learned_arrival_rate() -> None:
     readings = drawn(np.random.default_rng(3), 1)
-    world = WorldFilter()
-    for hop in range(0, 6000, 4):
-        nobody = Look("camera", hop * 10**8, Absent(0.04))
-        world = world.update(replace(heard(hop, readings[0]), look=nobody))
+    world = after(*(heard(number, readings[0], Absent(0.04)) for number in range(0, 6000, 4)))
     watched = world.memory.belief
     moved = np.log(watched.groups / watched.usual)
     assert [one.watched_s for one in watched.arrivals] == pytest.approx([553.0] * 2, abs=5.0)
     assert moved[:, 0] - moved[:, -1] == pytest.approx([-0.5, -0.5], abs=1e-9)
-    assert WorldFilter.from_dict(world.to_dict()).state == world.state
 
 
 @pytest.mark.parametrize("believed", ["left", "right"])
@@ -487,76 +439,62 @@ def test_peaks_move_an_unseen_emerged_vehicle(believed: str) -> None:
     A vehicle drives from 28 degrees left to 46 degrees right. In the first half second all peaks are
     reflections from the other side, and each peak describes the last second.
     """
-    k, readings = ("left", "right").index(believed), list[SequenceReading]()
-    coming, seen = (np.full((2, len(GROUPS)), 1e-3) for _ in range(2))
-    coming[k, GROUPS.index("coming_0.5s")], seen[:, GROUPS.index("seen")] = 0.52, 1.0
-    coming[1 - k, GROUPS.index("coming_0.5s")] = 0.43
-    coming[:, GROUPS.index("other")] = coming[::-1, : len(COMING_S)].sum(axis=1)
-    readings = [SequenceReading(one / one.sum(axis=1, keepdims=True), SHARE) for one in (coming, seen)]
+    here = {"left": (0.52, 0.43), "right": (0.43, 0.52)}[believed]
+    coming = reading({"coming_0.5s": here, "other": here[::-1]})
+    readings = [coming, reading({"seen": 1.0})]
     world, azimuths = WorldFilter(settings=EXACT), np.radians(np.linspace(28.0, -46.0, 25))
-    for hop in range(30):
+    for number in range(30):
         bearing: Bearing | NotUsable = SILENT
-        if hop >= 5:
-            late = math.radians(-48.0) if hop < 10 else float(azimuths[hop - 8])
+        if number >= 5:
+            late = math.radians(-48.0) if number < 10 else float(azimuths[number - 8])
             bearing = Bearing(late, math.radians(20.0), 3.0)
-        world = world.update(replace(heard(hop, readings[hop >= 5]), bearing=bearing))
-        if hop >= 24:
-            (car,) = world.state.entities
-            assert car.status == "emerged"
-            assert car.azimuth_rad == pytest.approx(azimuths[hop - 5], abs=math.radians(15.0))
+        world = world.update(replace(heard(number, readings[number >= 5]), bearing=bearing))
+        if number >= 24:
+            (one,) = world.state.entities
+            assert one.status == "emerged"
+            assert one.azimuth_rad == pytest.approx(azimuths[number - 5], abs=math.radians(15.0))
 
 
 def test_an_emerged_vehicle_decays_with_the_passage_time() -> None:
     """The sound ends before the vehicle leaves the view; an empty look ends the entity at once."""
     said = approach()[:45]
-    gone = np.full((2, len(GROUPS)), 1e-4)
-    gone[:, GROUPS.index("none")] = 1.0
-    said += [SequenceReading(gone / gone.sum(axis=1, keepdims=True), SHARE)] * 40
-    world = run(WorldFilter(settings=EXACT), [heard(hop + 1, one) for hop, one in enumerate(said)])
+    said += [reading({"none": 1.0}, rest=1e-4)] * 40
+    world = run(WorldFilter(settings=EXACT), all_heard(said))
     (before,) = world[44].state.entities
     for since_s in (0.5, 1.0, 1.5):
         (now,) = world[44 + round(10 * since_s)].state.entities
         expected = before.existence_probability * math.exp(-since_s / STREET.passage_s)
         assert now.status == "emerged" and now.id == before.id
         assert now.existence_probability == pytest.approx(expected, abs=0.01)
-    looked = world[49].update(heard(51, said[51], Absent(0.04, 0.01)))
+    looked = world[49].update(heard(51, said[51], ABSENT))
     assert not [one for one in looked.state.entities if one.existence_probability > 0.1]
 
 
 def test_visible_sound_makes_an_entity_without_a_camera() -> None:
-    unsure = np.full((2, len(GROUPS)), 1e-4)
-    unsure[:, GROUPS.index("none")] = 1.0
-    unsure[0, GROUPS.index("coming_0.5s")] = 0.8
-    before = SequenceReading(unsure / unsure.sum(axis=1, keepdims=True), SHARE)
+    before = reading({"none": 1.0, "coming_0.5s": (0.8, 1e-4)}, rest=1e-4)
     said = [before] * 5 + approach()[35:50]
-    for answer, found in ((UNASKED, 1), (Absent(0.04, 0.01), 0)):
-        measured = [heard(hop, one, UNASKED if hop < 5 else answer) for hop, one in enumerate(said)]
-        world = run(WorldFilter(settings=EXACT), measured)
+    for answer, found in ((UNASKED, 1), (ABSENT, 0)):
+        world = run(WorldFilter(settings=EXACT), all_heard(said, [UNASKED] * 5 + [answer] * 15, first=0))
         assert not world[4].state.entities and len(world[-1].state.entities) == found
 
 
 def test_a_tracked_vehicle_stays_one_entity_without_further_looks() -> None:
     """The continuing sound belongs to the tracked vehicle."""
     world, said = WorldFilter(settings=EXACT), approach()
-    for hop, one in enumerate(said + said[-1:] * 8, 1):
-        boxes = (Sighting(0.53 - 0.04 * (hop - 31), 0.02, "car", 0.9),) if 31 <= hop <= 34 else ()
-        answer = UNASKED if hop > 34 else Present(0.04, 0.01) if boxes else Absent(0.04, 0.01)
-        look = Look("camera", hop * 10**8, answer)
-        world = world.update(replace(heard(hop, one, answer), look=look, sightings=boxes))
-        if hop == 30:
+    for number, one in enumerate(said + said[-1:] * 8, 1):
+        boxes = [car(0.53 - 0.04 * (number - 31))] * (31 <= number <= 34)
+        answer = UNASKED if number > 34 else PRESENT if boxes else ABSENT
+        world = world.update(hop(number, NOBODY, *boxes, answer=answer, sequence=one))
+        if number == 30:
             (before,) = world.state.entities
-        elif hop > 30:
+        elif number > 30:
             (now,) = world.state.entities
             assert now.id == before.id and now.status != "hidden"
 
 
 def test_no_window_alarm_before_the_first_sequence() -> None:
-    sure = SignatureEvidence(("left", "right"), (9.0, 0.0), -1.0, -1.0)
-
     def warned(said: NotUsable | None) -> bool:
-        world = WorldFilter()
-        for hop in range(1, 9):
-            world = world.update(replace(heard(hop, said), signature=sure))
+        world = after(*(hop(number, SURE, sequence=said) for number in range(1, 9)))
         return any(cue.advisory is not None for cue in world.state.cues)
 
     assert warned(None) and warned(NotUsable("made for another array"))
@@ -565,11 +503,8 @@ def test_no_window_alarm_before_the_first_sequence() -> None:
 
 def test_early_windows_raise_no_alarm_of_the_sequence() -> None:
     """Windows give P(hidden), the sequence gives P(visible within three seconds)."""
-    sure = SignatureEvidence(("left", "right"), (9.0, 0.0), -1.0, -1.0)
-    groups = np.full((2, len(GROUPS)), 1e-3)
-    groups[:, [COMING - 1, -1]] = 0.4, 0.6  # Coming within eight seconds has 0.4
-    said = SequenceReading(groups / groups.sum(axis=1, keepdims=True), SHARE, 0.1, SequenceAlarm(-2.0, 30.0))
-    early = [replace(heard(hop, TOO_FEW), signature=sure) for hop in range(1, 9)]
-    worlds = run(WorldFilter(), [*early, *(heard(hop, said) for hop in range(9, 20))])
+    said = reading({"coming_8s": 0.4, GROUPS[-1]: 0.6}, -2.0)
+    early = [hop(number, SURE, sequence=TOO_FEW) for number in range(1, 9)]
+    worlds = run(WorldFilter(), [*early, *(heard(number, said) for number in range(9, 20))])
     assert not any(cue.advisory for world in worlds for cue in world.state.cues)
     assert min(cue.risk for cue in worlds[-1].state.cues) > 0.1
