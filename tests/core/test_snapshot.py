@@ -6,11 +6,13 @@ import json
 import math
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from functools import reduce
+from dataclasses import fields, replace
+from functools import cache, reduce
 from importlib.resources import files
+from operator import attrgetter
 from pathlib import Path
-from typing import get_args
+from types import UnionType
+from typing import Literal, Union, get_args, get_origin, get_type_hints
 
 import jsonschema
 import pytest
@@ -27,13 +29,13 @@ from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.adapters.export import dataframe
 from worldstate.ground import LEAST_HEARD, NotUsable
 from worldstate.ground.errors import InvalidArgumentError, SchemaVersionError, WorldstateError
+from worldstate.ground.serialisation import Count, Probability
 from worldstate.measurement import Bearing, Heard
 from worldstate.state import (
     Advisory,
     Budget,
     Classification,
     Context,
-    Delivery,
     Entity,
     Event,
     EvidenceTerms,
@@ -47,7 +49,6 @@ from worldstate.state import (
     SensorHealth,
     SideShare,
     Tally,
-    Visibility,
     WorldState,
     snapshot_schema,
 )
@@ -60,128 +61,67 @@ import json_schema
 
 SCHEMA = json.loads(files("worldstate").joinpath("data/snapshot.schema.json").read_text(encoding="utf-8"))
 VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
-unit = st.floats(0.0, 1.0)
-number = st.floats(allow_nan=False, allow_infinity=False, width=64)
-azimuth = st.floats(-math.pi, math.pi)
-stamp = st.integers(-(2**62), 2**62)
-name = st.text(max_size=12)
-vector = st.tuples(number, number, number)
-pair = st.tuples(number, number)
-
-
-def maybe(strategy):
-    return st.none() | strategy
-
-
-@st.composite
-def priors(draw):
-    hidden = draw(st.floats(0.0, 1.0))
-    visible = draw(st.floats(0.0, 1.0)) * (1.0 - hidden)
-    return Priors(hidden, visible, max(1.0 - hidden - visible, 0.0))
-
-
-entities = st.builds(
-    Entity,
-    id=st.uuids().map(str),
-    status=st.sampled_from(["hidden", "emerged", "visible", None]),
-    existence_probability=unit,
-    hidden_probability=maybe(unit),
-    azimuth_rad=azimuth,
-    azimuth_std_rad=number,
-    created_ns=stamp,
-    updated_ns=stamp,
-    classification=maybe(st.lists(st.builds(Classification, name, unit), max_size=3).map(tuple)),
-    moving=st.booleans(),
-    direction=maybe(name),
-    azimuth_rate_rad_s=maybe(number),
-    range_m=maybe(number),
-    position_m=maybe(vector),
-    velocity_mps=maybe(vector),
-    inverse_tta_hz=maybe(number),
-    inverse_tta_std_hz=maybe(number),
-    tta_s=maybe(number),
-    visibility=st.builds(Visibility, st.sampled_from(["visible", "absent", "unqueried"]), maybe(unit)),
-    sources=st.lists(name, max_size=2).map(tuple),
-    last_seen_ns=maybe(stamp),
-    sector_rad=maybe(pair),
-    azimuth_covariance=maybe(vector),
-    forecast=maybe(st.dictionaries(name, pair, max_size=2)),
-)
-relations = st.builds(Relation, name, name, name, unit, stamp)
-sensors = st.builds(
-    SensorHealth, name, st.sampled_from(["working", "impaired", "silent"]), stamp, maybe(name)
-)
+unit, name, stamp = st.floats(0.0, 1.0), st.text(max_size=12), st.integers(-(2**62), 2**62)
+azimuth, number = st.floats(-math.pi, math.pi), st.floats(allow_nan=False, allow_infinity=False)
+VALUES = {
+    float: number, int: stamp, str: name, bool: st.booleans(), type(None): st.none(),
+    Probability: unit, Count: st.integers(0, 2**40),
+}  # fmt: skip
 REASONS = get_args(WhyNot)
-cues = st.builds(
-    lambda why_not, **fields: RiskCue(**fields, usable=not why_not, why_not=tuple(why_not)),
-    why_not=st.lists(st.sampled_from(REASONS), unique=True),
-    direction=maybe(name),
-    azimuth_rad=azimuth,
-    azimuth_std_rad=number,
-    risk=maybe(unit),
-    confidence=maybe(unit),
-    statistic=maybe(unit),
-    log_lambda=maybe(number),
-    hypotheses=maybe(priors()),
-    advisory=maybe(st.builds(Advisory, stamp, stamp, st.lists(sensors, max_size=2).map(tuple))),
-    alpha=maybe(unit),
-    entity_id=maybe(name),
-    horizon_s=maybe(number),
-    within=maybe(st.dictionaries(name, unit, max_size=2)),
-    time_to_visible_s=maybe(vector),
-    sector_rad=maybe(pair),
-    evidence=maybe(
-        st.builds(
-            EvidenceTerms,
-            st.sampled_from(["coming", "hidden"]),
-            st.dictionaries(name, number, max_size=2),
-            number,
-            number,
-        )
-    ),
+
+
+@cache
+def values(hint):
+    """Return the values of a type, as its annotations describe them."""
+    kind, args = get_origin(hint), get_args(hint)
+    if hint in VALUES:
+        return VALUES[hint]
+    if kind is Literal:
+        return st.sampled_from(args)
+    if kind in (Union, UnionType):
+        return st.one_of(*map(values, args))
+    if kind is tuple and args[-1] is not Ellipsis:
+        return st.tuples(*map(values, args))
+    if kind is tuple:
+        return st.lists(values(args[0]), max_size=3).map(tuple)
+    if kind is Mapping:
+        return st.dictionaries(name, values(args[1]), max_size=2)
+    return built(hint)
+
+
+def built(kind, **special):
+    """Return a dataclass with values of its fields' types."""
+    hints = get_type_hints(kind, include_extras=True)
+    of_fields = {one.name: values(hints[one.name]) for one in fields(kind) if one.init}
+    angles = {key: azimuth for key in of_fields if key == "azimuth_rad"}
+    return st.builds(kind, **of_fields | angles | special)
+
+
+def unlike(kind, *keys):
+    """Return up to three values that differ in these fields."""
+    return st.lists(values(kind), max_size=3, unique_by=attrgetter(*keys)).map(tuple)
+
+
+chances = st.tuples(unit, unit).map(lambda two: (two[0], two[1] * (1.0 - two[0])))
+VALUES[Priors] = chances.map(lambda two: Priors(*two, max(1.0 - sum(two), 0.0)))
+VALUES[Rates] = st.builds(Rates, *[st.floats(0, 10)] * 6)
+VALUES[Bearing] = st.builds(Bearing, azimuth, st.floats(0.01, 3.0))
+VALUES[Occluder] = st.builds(Occluder, name, name, azimuth, azimuth, st.floats(0.01, 3.0))
+names = attrgetter("id"), attrgetter("direction")
+occluders = st.lists(values(Occluder), min_size=1, max_size=3, unique_by=names)
+VALUES[Context] = built(
+    Context, occluders=occluders.map(tuple), ego_speed_mps=st.none() | st.floats(-100, 100),
+    view_half_angle_rad=st.floats(0, 3), hidden_by_side=st.none(),
+)  # fmt: skip
+reasons = st.lists(st.sampled_from(REASONS), unique=True).map(tuple)
+VALUES[RiskCue] = st.tuples(built(RiskCue, usable=st.just(False), why_not=st.just(("masked",))), reasons).map(
+    lambda pair: replace(pair[0], usable=not pair[1], why_not=pair[1])
 )
-shares = maybe(st.dictionaries(name, unit, max_size=3))
-hearings = st.builds(Hearing, name, unit, stamp, st.sampled_from([None, "wind", MASKED]), shares)
-verdicts = st.sampled_from(["kept", "in doubt", "broken", "unwatched"])
-budgets = st.builds(
-    Budget, verdicts, maybe(name), st.dictionaries(name, number, max_size=2), number, st.just(Tally())
-)
-kinds = ["born", "handed_over", "coasting", "hidden_again", "died", "merged"]
-events = st.builds(Event, stamp, st.sampled_from(kinds), name)
-views = st.builds(SearchedView, name, stamp, st.booleans(), unit, unit, pair)
-occluders = st.builds(Occluder, name, name, azimuth, azimuth, st.floats(0.01, 3.0))
-contexts = st.builds(
-    Context,
-    rates=st.builds(Rates, *[st.floats(0, 10)] * 6),
-    occluders=st.lists(
-        occluders, min_size=1, max_size=3, unique_by=(lambda o: o.id, lambda o: o.direction)
-    ).map(tuple),
-    priors=maybe(priors()),
-    ego_speed_mps=maybe(st.floats(-100, 100)),
-    degradation=maybe(unit),
-    site=maybe(name),
-    view_half_angle_rad=st.floats(0, 3),
-)
-states = st.builds(
-    WorldState,
-    stamp_ns=stamp,
-    seq=st.integers(0, 2**40),
-    entities=st.lists(entities, max_size=4, unique_by=lambda e: e.id).map(tuple),
-    relations=st.lists(relations, max_size=4, unique_by=lambda r: (r.src, r.dst, r.kind)).map(tuple),
-    context=contexts,
-    cues=st.lists(cues, max_size=3, unique_by=lambda c: (c.direction, c.azimuth_rad)).map(tuple),
-    clock=name,
-    calibrated=st.booleans(),
-    domain=st.sampled_from([None, Familiar(-2.0), Foreign("sounds like speech", 2.0)]),
+states = built(
+    WorldState, entities=unlike(Entity, "id"), relations=unlike(Relation, "src", "dst", "kind"),
+    cues=unlike(RiskCue, "direction", "azimuth_rad"), seq=st.integers(0, 2**40), no_model=st.none(),
     no_sequence=st.sampled_from([None, TOO_FEW, NotUsable("the model has none")]),
-    heard=maybe(st.lists(hearings, max_size=2, unique_by=lambda h: h.sensor).map(tuple)),
-    budget=maybe(budgets),
-    valid_until_ns=maybe(stamp),
-    sensors=st.lists(sensors, max_size=2, unique_by=lambda s: s.sensor).map(tuple),
-    searched=st.lists(views, max_size=2, unique_by=lambda v: v.sensor).map(tuple),
-    events=st.lists(events, max_size=2).map(tuple),
-    delivery=st.builds(Delivery, *[st.integers(0, 9)] * 4),
-)
+)  # fmt: skip
 
 
 @given(states)
@@ -378,12 +318,6 @@ def test_a_cut_text_is_refused(cut):
         WorldState.from_json(full_state().to_json()[:cut])
 
 
-@pytest.mark.parametrize("text", ["NaN", "[" * 100_000, "1" * 5000, '{"a": Infinity}'])
-def test_no_json_is_refused(text):
-    with pytest.raises(InvalidArgumentError):
-        WorldState.from_json(text)
-
-
 def test_unknown_keys_are_ignored_and_minor_versions_read():
     value = full_state().to_dict()
     value |= {"mood": "fine", "schema": {"name": "worldstate.Snapshot", "version": "4.9.3"}}
@@ -407,12 +341,6 @@ def test_json_never_says_nan():
     entity = Entity("a", "hidden", 0.9, 0.8, math.nan, 0.3, 1, 2)
     with pytest.raises(InvalidArgumentError, match="finite"):
         WorldState(0, 0, (entity,)).to_json()
-
-
-def test_unknown_is_null():
-    written = json.loads(full_state().to_json())["entities"][0]
-    unknown = ("range_m", "position_m", "velocity_mps", "tta_s", "last_seen_ns")
-    assert [written[key] for key in unknown] == [None] * 5
 
 
 STREET = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02), start_ns=START_NS)
