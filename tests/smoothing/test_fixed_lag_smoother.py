@@ -46,15 +46,10 @@ def test_rts_of_filterpy_agrees():
     np.testing.assert_allclose(track.covariance, spread, atol=1e-6)
 
 
-def test_later_positions_correct_the_hidden_phase():
-    filtered, smoothed = np.array([hidden_errors_m(seed) for seed in range(5)]).T
-    assert np.sqrt((smoothed**2).mean()) < 0.25 * np.sqrt((filtered**2).mean())
-
-
-@pytest.mark.slow
-def test_smoothing_reduces_the_error_to_a_fifth():
-    filtered, smoothed = np.array([hidden_errors_m(seed) for seed in range(60)]).T
-    assert np.sqrt((smoothed**2).mean()) < 0.2 * np.sqrt((filtered**2).mean())
+@pytest.mark.parametrize(("passes", "share"), [(5, 0.25), pytest.param(60, 0.2, marks=pytest.mark.slow)])
+def test_later_positions_correct_the_hidden_phase(passes, share):
+    filtered, smoothed = np.array([hidden_errors_m(seed) for seed in range(passes)]).T
+    assert np.sqrt((smoothed**2).mean()) < share * np.sqrt((filtered**2).mean())
 
 
 @pytest.mark.parametrize(("own_state", "within_m"), [(True, 1e-6), (False, 0.1)])

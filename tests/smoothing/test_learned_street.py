@@ -33,13 +33,6 @@ def street_of(passes: int, seed: int = 0) -> LearnedStreet:
     return street
 
 
-def edge_after(*degrees: float) -> LearnedEdge:
-    edge = LearnedEdge()
-    for one in degrees:
-        edge = edge.with_pass(math.radians(one))
-    return edge
-
-
 def test_ten_passes_determine_edges_and_pace():
     left, right = context_of(street_of(10)).occluders
     assert abs(left.edge_azimuth_rad - LEFT) < math.radians(0.5)
@@ -68,22 +61,20 @@ def test_the_predictive_density_is_that_of_scipy():
     assert moments.log_predictive(0.47, prior) == pytest.approx(told)
 
 
-def test_a_moved_edge_is_learned_anew_within_three_passes():
-    moved = edge_after(30.0, 30.2, 29.9, 30.1, 30.0, 24.0, 24.1, 24.0)
-    assert moved.changes == 1
-    assert abs(math.degrees(moved.mean_rad) - 24.0) < 0.5
-
-
-def test_a_stray_pass_changes_nothing():
-    edge = edge_after(30.0, 30.2, 12.0, 29.9, 30.1, 30.0)
-    assert edge.changes == 0
-    assert abs(math.degrees(edge.mean_rad) - 30.0) < 0.5
-
-
-def test_a_first_stray_pass_is_corrected_without_a_change():
-    edge = edge_after(15.0, 30.0, 30.1, 29.9)
-    assert edge.changes == 0
-    assert abs(math.degrees(edge.mean_rad) - 30.0) < 1.0
+@pytest.mark.parametrize(
+    ("passes_deg", "edge_deg", "within_deg", "changes"),
+    [
+        ((30.0, 30.2, 29.9, 30.1, 30.0, 24.0, 24.1, 24.0), 24.0, 0.5, 1),  # The edge has moved
+        ((30.0, 30.2, 12.0, 29.9, 30.1, 30.0), 30.0, 0.5, 0),  # A stray pass
+        ((15.0, 30.0, 30.1, 29.9), 30.0, 1.0, 0),  # A first stray pass
+    ],
+)
+def test_a_moved_edge_is_learned_and_a_stray_pass_is_not(passes_deg, edge_deg, within_deg, changes):
+    edge = LearnedEdge()
+    for one in passes_deg:
+        edge = edge.with_pass(math.radians(one))
+    assert edge.changes == changes
+    assert abs(math.degrees(edge.mean_rad) - edge_deg) < within_deg
 
 
 def test_forgetting_reduces_weights_and_keeps_means():
@@ -104,11 +95,7 @@ def test_forgetting_in_two_steps_equals_one_step():
         assert before.exposure_s == pytest.approx(after.exposure_s)
 
 
-def test_a_learned_street_keeps_the_usual_rates():
-    assert context_of(street_of(10)).rates == Rates()
-
-
-def test_a_filter_keeps_the_learned_street_in_its_checkpoint():
+def test_a_filter_keeps_a_learned_street_with_the_usual_rates_in_its_checkpoint():
     world = WorldFilter(context_of(street_of(10))).predict(0.3)
-    again = WorldFilter.from_dict(world.to_dict())
-    assert again.context.occluders == world.context.occluders
+    assert world.context.rates == Rates()
+    assert WorldFilter.from_dict(world.to_dict()).context == world.context
