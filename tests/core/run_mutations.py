@@ -14,14 +14,12 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPECTED, EXAMPLE = 0.9, "Example: python tests/core/run_mutations.py --area belief --only 5"
-FREEZE_TEST = "tests/core/test_fault_campaign.py::test_no_published_quantity_stays_at_one_value"
 _SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.stats", "scipy.signal")
 _ELSEWHERE = (*_SCIPY, "hypothesis", "jsonschema", "pytest")
 
@@ -55,7 +53,7 @@ def copied(root: Path) -> None:
             shutil.copy2(ROOT / name, root / name)
 
 
-def noticed_by(root: Path, tests: tuple[str, ...], limit_s: float, freeze: str | None = None) -> str | None:
+def noticed_by(root: Path, tests: tuple[str, ...], limit_s: float) -> str | None:
     """Return the first failing test or a timeout; None if all pass."""
     out = root / "out.txt"
     child = os.fork()
@@ -64,8 +62,6 @@ def noticed_by(root: Path, tests: tuple[str, ...], limit_s: float, freeze: str |
             os.dup2(file.fileno(), 1), os.dup2(file.fileno(), 2)
         os.chdir(root)
         os.environ["PYTHONPATH"] = f"{root}:{root / 'lab'}"
-        if freeze:
-            os.environ["WORLDSTATE_FREEZE"] = freeze
         sys.path[:0] = [str(root), str(root / "lab")]
         plain = ("-q", "-x", "--tb=no", "-rfE", "-p", "no:xdist", "-p", "no:cacheprovider")
         os._exit(import_module("pytest").main([*plain, *tests]))
@@ -91,28 +87,10 @@ def mutated(root: Path, one: Mutation, stages: Stages, limit_s: float) -> str | 
     stat, text = path.stat(), path.read_text()
     assert text.count(one.old) == 1, one.name
     path.write_text(text.replace(one.old, one.new))
-    noticed = first_of(root, stages, limit_s)
+    noticed = next(filter(None, (noticed_by(root, tests, limit_s) for tests in stages)), None)
     path.write_text(text)
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # The compiled file is valid again
     return noticed
-
-
-def first_of(root: Path, stages: Stages, limit_s: float, freeze: str | None = None) -> str | None:
-    return next(filter(None, (noticed_by(root, tests, limit_s, freeze) for tests in stages)), None)
-
-
-def results(root: Path, told: argparse.Namespace) -> Iterator[tuple[str, str, str | None]]:
-    """Yield area, name and failing test of every mutation, or of every frozen quantity."""
-    rest = [] if told.quick else [("tests/core",)]
-    if told.freeze:
-        sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
-        names = [one for one in import_module("published_quantities").quantities() if told.match in one]
-        for name in names[: told.only]:
-            yield "freeze", name, first_of(root, [(FREEZE_TEST,), *rest], told.limit, name)
-        return
-    of_area = [one for one in MUTATIONS if told.area in (None, one.area) and told.match in one.name]
-    for one in of_area[: told.only]:
-        yield one.area, one.name, mutated(root, one, [(one.test,), *rest], told.limit)
 
 
 def main() -> bool:
@@ -121,7 +99,6 @@ def main() -> bool:
     parser.add_argument("--area", choices=AREAS, help="area of the mutations; default: all")
     parser.add_argument("--match", default="", metavar="TEXT", help="only mutations with this text in a name")
     parser.add_argument("--only", type=int, metavar="N", help="only the first N")
-    parser.add_argument("--freeze", action="store_true", help="freeze published quantities instead")
     parser.add_argument("--quick", action="store_true", help="run only the listed test of each")
     parser.add_argument("--limit", type=float, default=600.0, metavar="S", help="seconds per run; 600")
     told = parser.parse_args()
@@ -134,16 +111,18 @@ def main() -> bool:
         noticed_by(root, ("--collect-only", "tests/core"), told.limit)  # Compile all files first
         sys.dont_write_bytecode = True
         last_s = time.monotonic()
-        for area, name, by in results(root, told):
-            every[area] += 1
-            noticed[area] += by is not None
+        of_area = [one for one in MUTATIONS if told.area in (None, one.area) and told.match in one.name]
+        rest = [] if told.quick else [("tests/core",)]
+        for one in of_area[: told.only]:
+            by = mutated(root, one, [(one.test,), *rest], told.limit)
+            every[one.area] += 1
+            noticed[one.area] += by is not None
             took_s, last_s = time.monotonic() - last_s, time.monotonic()
-            print(f"{every.total()} {area} {took_s:.0f} s: {name}: {by or 'SURVIVED'}", flush=True)
+            print(f"{every.total()} {one.area} {took_s:.0f} s: {one.name}: {by or 'SURVIVED'}", flush=True)
     for area, number in every.items():
         print(f"{area}: {noticed[area]} of {number}, {noticed[area] / number:.0%}")
     print(f"{time.monotonic() - start_s:.0f} s")
-    least = 1.0 if told.freeze else EXPECTED
-    return all(noticed[area] >= least * number for area, number in every.items())
+    return all(noticed[area] >= EXPECTED * number for area, number in every.items())
 
 
 if __name__ == "__main__":

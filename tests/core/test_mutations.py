@@ -6,7 +6,6 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from published_quantities import CONSTANT, quantities
 
 sys.path.insert(0, str(Path(__file__).parent))
 from run_mutations import AREAS, MUTATIONS
@@ -28,14 +27,8 @@ def _exists(test: str) -> bool:
     return (ROOT / file).is_file() and (not name or f"def {name}(" in (ROOT / file).read_text())
 
 
-def test_every_field_of_a_snapshot_is_a_quantity_or_constant() -> None:
-    assert {"RiskCue.risk", "Entity.azimuth_rad", "Hearing.share", "Priors.hidden"} <= set(quantities())
-    assert CONSTANT.isdisjoint(quantities())
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("held", [(), ("--freeze",)])
-def test_90_per_cent_of_mutations_and_all_frozen_quantities_are_detected(held: tuple[str, ...]) -> None:
-    program = [sys.executable, str(ROOT / "tests/core/run_mutations.py"), *held]
+def test_90_per_cent_of_mutations_are_detected() -> None:
+    program = [sys.executable, str(ROOT / "tests/core/run_mutations.py")]
     done = subprocess.run(program, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]

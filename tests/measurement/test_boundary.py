@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from street_measurements import hop
 
 from worldstate.abduction.co_evidence import Absent
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
@@ -45,10 +46,9 @@ RATE_HZ = 48_000
 CAR = Sighting(0.1, 0.02, "car", 0.9)
 
 
-def measured(hop, hidden=(4.0, 0.0), **changes):
-    heard = SignatureEvidence(("left", "right"), hidden, 2.0, 0.0)
-    look = Measurement(hop * 10**8, heard, Absent(0.04), Bearing(0.3, 0.1), Approach(0.2, 0.1), (CAR,))
-    return replace(look, **changes)
+def measured(number, hidden=(4.0, 0.0), **changes):
+    whole = {"answer": Absent(0.04), "bearing": Bearing(0.3, 0.1), "approach": Approach(0.2, 0.1)}
+    return replace(hop(number, (*hidden, 2.0, 0.0), CAR, **whole), **changes)
 
 
 def street(rng, seconds):
@@ -152,8 +152,8 @@ def drives_past(built):
     if isinstance(built, Occluder):
         built = Context(occluders=(built, blind_corner("right", -1)))
     world = WorldFilter(Context(rates=built) if isinstance(built, Rates) else built)
-    for hop, x_m in enumerate((-1e3, 0.0, 4.9, 8.95, 9.0, 9.05, 1e3)):
-        world = world.update(Odometry("wheels", (hop + 1) * 10**8, 5.0, pose=EgoPose((x_m, 0.0))))
+    for at, x_m in enumerate((-1e3, 0.0, 4.9, 8.95, 9.0, 9.05, 1e3)):
+        world = world.update(Odometry("wheels", (at + 1) * 10**8, 5.0, pose=EgoPose((x_m, 0.0))))
         assert WorldState.from_json(world.state.to_json()) == world.state
 
 
@@ -195,15 +195,15 @@ def test_the_largest_stamp_gives_a_readable_state():
 
 def test_integers_and_numpy_numbers_are_accepted():
     plain, other = WorldFilter(), WorldFilter()
-    for hop in range(1, 30):
+    for at in range(1, 30):
         numbers = {
-            "stamp_ns": np.int64(hop * 10**8),
+            "stamp_ns": np.int64(at * 10**8),
             "signature": SignatureEvidence(("left", "right"), (4, np.float32(0)), np.int64(2), 0),
             "co_evidence": Absent(np.float64(0.04)),
-            "sightings": (replace(CAR, score=np.float64(0.9)),) if hop > 20 else (),
+            "sightings": (replace(CAR, score=np.float64(0.9)),) if at > 20 else (),
         }
-        plain = plain.update(measured(hop, sightings=(CAR,) if hop > 20 else ()))
-        other = other.update(measured(hop, **numbers))
+        plain = plain.update(measured(at, sightings=(CAR,) if at > 20 else ()))
+        other = other.update(measured(at, **numbers))
     assert other.state.to_json() == plain.state.to_json()
     assert json.dumps(other.to_dict()) == json.dumps(plain.to_dict())
 
