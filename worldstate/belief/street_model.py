@@ -137,9 +137,6 @@ class StreetModel:
         return cls(**values, sources=StreetNumbers({**_SHIPPED.numbers, **told}))
 
 
-def _stored(street: StreetModel) -> StreetNumbers:
-    return StreetNumbers(street.described)
-
-
 # A street model in files and checkpoints.
-StoredStreet: TypeAlias = Annotated[StreetModel, Via(StreetNumbers, _stored, StreetModel.of)]
+_STORED = Via(StreetNumbers, lambda street: StreetNumbers(street.described), StreetModel.of)
+StoredStreet: TypeAlias = Annotated[StreetModel, _STORED]

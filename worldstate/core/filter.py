@@ -12,7 +12,7 @@ from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.ground import InvalidArgumentError, NotUsable, in_range, integer_ns, nanoseconds, replaced
 from worldstate.ground.serialisation import ADDED, Layout, decode, encode
-from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan, Sighting
+from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan
 from worldstate.state import Context, Cues, Event, Priors, WorldState
 from worldstate.state.world_state import judged
 
@@ -310,12 +310,9 @@ def _fitting(measurement: object, context: Context) -> tuple[Timed, int]:
     every = (measurement.sightings, *(one.sightings for one in measurement.further))
     left_out = sum(max(len(boxes) - MOST_BOXES, 0) for boxes in every)
     if left_out:
-        first, *others = (tuple(sorted(boxes, key=_first_counting)[:MOST_BOXES]) for boxes in every)
+        # Moving ones and high scores first, independent of their order.
+        ranked = (sorted(boxes, key=lambda one: (not one.moving, -one.score, BY_ALL(one))) for boxes in every)
+        first, *others = (tuple(boxes[:MOST_BOXES]) for boxes in ranked)
         further = map(CameraLook, (one.look for one in measurement.further), others)
         measurement = replaced(measurement, sightings=first, further=tuple(further))
     return measurement, left_out
-
-
-def _first_counting(one: Sighting) -> tuple[object, ...]:
-    """Return the sort key of boxes: moving ones and high scores first, independent of their order."""
-    return not one.moving, -one.score, BY_ALL(one)
