@@ -185,9 +185,7 @@ def _streams(
     for (number, name), (traffic, minutes) in product(names.items(), minutes_of.items()):
         own = first_seed + number + SEEDS_EACH * settings.seed
         each = DRIVES_S[traffic] / 60.0 if settings.moving_ego else minutes
-        whole = StreamSettings(
-            junction_named(name), each, own, traffic_named(traffic), sample_rate_hz=rate_hz
-        )
+        whole = StreamSettings(junction_named(name), each, own, traffic_named(traffic), sample_rate_hz=rate)
         drives = ceil(minutes / whole.minutes - 1e-9) if settings.moving_ego else 0
         found += [replace(whole, seed=own * DRIVES_EACH + i) for i in range(drives)] or [whole]
     return found
