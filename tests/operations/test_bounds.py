@@ -143,9 +143,3 @@ def test_an_array_that_faces_left_has_no_bearing_ahead(tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["broadside_deg"] == pytest.approx(90.0)
     assert found["sigma_deg"]["0"] is None
-
-
-def test_an_upright_line_has_no_bearing(tmp_path, capsys):
-    write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0, 0], [0, 0, 0.1]]))
-    assert main(["array", "bounds", "--array", str(tmp_path / "mics.xml")]) == 2
-    assert "horizontal extent" in capsys.readouterr().err

@@ -169,15 +169,11 @@ def test_the_threshold_command_reads_a_sound_file(tmp_path, capsys):
     assert not heard.answer.any()
 
 
-@pytest.mark.parametrize("name", ["missing.wav", "text.wav", "text.npz"])
-def test_bad_input_gives_one_line_and_no_file(name, tmp_path, capsys):
-    path = tmp_path / name
-    if not name.startswith("missing"):
-        path.write_text("no sound")
-    assert main(["model", "threshold", str(path), "--out", str(tmp_path / "model.json")]) == 2
-    captured = capsys.readouterr()
-    assert name in captured.err
-    assert not (tmp_path / "model.json").exists()
+def test_a_missing_input_gives_one_line_and_no_file(tmp_path, capsys):
+    out = tmp_path / "model.json"
+    assert main(["model", "threshold", str(tmp_path / "missing.wav"), "--out", str(out)]) == 2
+    assert "missing.wav" in capsys.readouterr().err
+    assert not out.exists()
 
 
 @given(st.floats(0.0, 0.9))

@@ -110,9 +110,3 @@ def test_the_learn_command_continues_a_street_and_run_uses_it(approach, tmp_path
     assert main(["run", str(approach.folder), "--context", str(out), "--out", str(states)]) == 0
     context = json.loads(states.read_text().splitlines()[-1])["context"]
     assert context["site"] == "here"
-
-
-def test_detections_belong_to_one_recording(approach, capsys):
-    inputs = [str(approach.folder)] * 2
-    assert main(["street", "learn", *inputs, "--detections", "a.json", "--out", "b.json"]) == 2
-    assert "--detections" in capsys.readouterr().err
