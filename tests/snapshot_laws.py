@@ -1,5 +1,6 @@
 """Laws of a snapshot and of consecutive snapshots."""
 
+import math
 from collections.abc import Iterator
 
 from worldstate import WorldState
@@ -31,6 +32,13 @@ def _chances(state: WorldState) -> Iterator[str]:
     stated += [chance for cue in state.cues for chance in (cue.risk, *(cue.within or {}).values())]
     if not all(0.0 <= one <= 1.0 for one in stated):
         yield "a chance outside of 0 to 1"
+    if len({one.id for one in state.entities}) < len(state.entities):
+        yield "two entities of one name"
+    for one in state.entities:
+        if not 0.0 <= (one.hidden_probability or 0.0) <= one.existence_probability:
+            yield f"P(hidden) {one.hidden_probability} of an existence of {one.existence_probability}"
+        if abs(one.azimuth_rad) > math.pi or one.azimuth_std_rad <= 0.0:
+            yield f"an azimuth of {one.azimuth_rad} +- {one.azimuth_std_rad}"
     if len(state.entities) > 128 or len(state.events) > 64:
         yield "more entities or events than a snapshot holds"
     names = {one.id for one in (*state.entities, *state.context.occluders)} | {"ego"}

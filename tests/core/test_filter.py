@@ -340,50 +340,7 @@ def test_a_first_box_is_weighted_by_its_score_and_the_clutter(score, clutter):
     assert gone[0].existence_probability < born.existence_probability
 
 
-angles = st.floats(-0.6, 0.6)
-classes = st.tuples(*[st.floats(0.02, 1.0)] * 4)
-sightings = st.lists(st.builds(car, angles, moving=st.booleans()), max_size=3).map(tuple)
-answers = st.one_of(
-    st.builds(Absent, st.floats(0.0, 1.0)),
-    st.builds(Present, st.floats(0.0, 1.0), st.floats(0.001, 0.2)),
-    st.just(Unqueried("-")),
-)
-bearings = st.one_of(st.just(SILENT), st.builds(Bearing, st.floats(-3.1, 3.1), st.floats(0.01, 1.0)))
 approaches = st.one_of(st.just(SILENT), st.builds(Approach, st.floats(-2.0, 2.0), st.floats(0.05, 1.0)))
-gaps = st.sampled_from([0.0, 0.1, 0.1001, 0.5, 3.0])
-
-
-@st.composite
-def scripts(draw):
-    time_s, script = 1.0, []
-    for _ in range(draw(st.integers(1, 12))):
-        time_s += draw(gaps)
-        heard = draw(st.sampled_from([LEFT, RIGHT, FRONT, QUIET]) | classes)
-        seen = draw(sightings)
-        answer, bearing, approach = draw(answers), draw(bearings), draw(approaches)
-        script.append(measured(time_s, heard, *seen, answer=answer, bearing=bearing, approach=approach))
-    return script
-
-
-@settings(max_examples=60, deadline=None)
-@given(scripts())
-def test_every_state_is_consistent(script):
-    world = start()
-    for measurement in script:
-        world = world.update(measurement)
-        state = world.state
-        assert sum(world.belief.hypotheses) == pytest.approx(1.0)
-        assert type(state).from_json(state.to_json()) == state
-        assert len({e.id for e in state.entities}) == len(state.entities)
-        risks = [cue.risk for cue in state.cues]
-        assert max(risks) - 1e-9 <= world.risk <= sum(risks) + 1e-9
-        for entity in state.entities:
-            side = None if entity.sides else ("left", "right").index(entity.direction)
-            if entity.last_seen_ns is None:
-                assert entity.hidden_probability == pytest.approx(world.belief.hidden_on(side))
-            assert 0 <= entity.hidden_probability <= entity.existence_probability <= 1
-            assert -math.pi < entity.azimuth_rad <= math.pi
-            assert entity.azimuth_std_rad > 0
 
 
 @settings(max_examples=40, deadline=None)
