@@ -15,7 +15,6 @@ from worldstate.abduction.grounding.grounded_likelihood import Grounding as Grou
 from worldstate.abduction.road_users import (
     ClassShares,
     DomainGuard,
-    DomainVerdict,
     Foreign,
     RoadUserModel,
     expected_labels,
@@ -247,7 +246,11 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
             signature = with_bearing_vote(signature, bearing.azimuth_rad, bearing.std_rad, direct)
         if self._grounding is not None:
             signature = self._grounding.answer(signature, observe(frame, bearing, approach)).evidence
-        domain, kinds = self._recognised(frame)
+        domain, character = None, frame.character
+        kinds: ClassShares = ()
+        if not isinstance(character, NotUsable):
+            domain = None if self._guard is None else self._guard.judge(character[: len(MEASURES)])
+            kinds = () if self._road_users is None else heard_kinds(self._road_users, character, domain)
         if isinstance(domain, Foreign) and self._guard is not None:
             signature, heard = (neutral(one, self._guard.margin) for one in (signature, heard))
             share = beside_foreign(domain, share)
@@ -256,14 +259,6 @@ class AcousticAdapter(MeasurementAdapter[Float32Array]):
         sequence = read_hop(reader, heard, frame) if isinstance(reader, SequenceReader) else reader
         read = {"heard": share, "signature": signature, "bearing": bearing, "approach": approach}
         return read | {"domain": domain, "kinds": kinds, "sequence": sequence}
-
-    def _recognised(self, frame: AcousticFrame) -> tuple[DomainVerdict | None, ClassShares]:
-        """Return whether the sound is within the models' domain, and the likely road users."""
-        character, guard, model = frame.character, self._guard, self._road_users
-        if isinstance(character, NotUsable):
-            return None, ()
-        domain = None if guard is None else guard.judge(character[: len(MEASURES)])
-        return domain, () if model is None else heard_kinds(model, character, domain)
 
 
 def read_hop(

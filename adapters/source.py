@@ -36,29 +36,17 @@ from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoin
 from worldstate.adapters.files.context_file import read_context
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog, read_odometry
-from worldstate.adapters.ros.bag_input import (
-    BagSound,
-    is_bag,
-    needed_array,
-    read_beside,
-    read_sound,
-)
+from worldstate.adapters.ros.bag_input import BagSound, is_bag, needed_array, read_beside, read_sound
 from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors, read_camera_setup, read_car
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.street_model import StreetModel
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz, default_span_deg
-from worldstate.ground import (
-    InputFileError,
-    InvalidArgumentError,
-    NotUsable,
-    OutOfDomainError,
-    in_range,
-    nanoseconds,
-)
+from worldstate.ground.checks import in_range
+from worldstate.ground.errors import InputFileError, InvalidArgumentError, OutOfDomainError
 from worldstate.ground.typing import FloatArray
-from worldstate.ground.values import seconds
+from worldstate.ground.values import NotUsable, nanoseconds, seconds
 from worldstate.state import Context
 
 from .acoustic import Grounding, Signature
@@ -469,7 +457,8 @@ def open_source(
     sound, named = sound_of(path, topics or {})
     recording = Recording.open(sound) if isinstance(sound, Path) and sound.is_dir() else None
     bag = sound if isinstance(sound, BagSound) and sound is not path else None
-    boxes, ego = (None, None) if bag is None else _beside(bag, topics or {})
+    beside = {name: topic for name, topic in (topics or {}).items() if name != "audio"}
+    boxes, ego = (None, None) if bag is None else read_beside(bag, **beside)
     place, sensors = _place(context), SourceSensors.of(array, car, camera)
     asked = sensors.boxes_in(settings_with(settings, budget, alpha, uncalibrated), detector)
     drive = _read(odometry or sensors.car.odometry, read_odometry)
@@ -532,10 +521,6 @@ def raw_pcm(name: str, form: str, stream: BinaryIO, path: str = "/dev/stdin") ->
     if not (rate.isdecimal() and channels.isdecimal()):
         raise InvalidArgumentError(f"{name}: expected RATE:CHANNELS:FORMAT, such as 48000:8:s32")
     return RawPcm(stream, int(rate), int(channels), cast("Encoding", encoding or "s16"), path)
-
-
-def _beside(sound: BagSound, topics: Mapping[str, str]) -> tuple[DetectionLog | None, OdometryLog | None]:
-    return read_beside(sound, **{name: topic for name, topic in topics.items() if name != "audio"})
 
 
 def settings_with(

@@ -9,15 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from worldstate.abduction.co_evidence import (
-    Absent,
-    CoEvidence,
-    MissRateTable,
-    Present,
-    Sector,
-    Unqueried,
-    default_miss_rates,
-)
+from worldstate.abduction import Absent, MissRateTable, Present, Unqueried
+from worldstate.abduction.co_evidence import CoEvidence, Sector, default_miss_rates
 from worldstate.core.memory import MOST_BOXES
 from worldstate.ground import InputFileError, InvalidArgumentError, NotUsable
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
