@@ -10,11 +10,12 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from http.client import parse_headers
-from typing import Any, Self
+from typing import Any
 from urllib.parse import urlsplit
 
 from worldstate.ground import InvalidArgumentError, seconds
 from worldstate.ground.extras import optional
+from worldstate.ground.threads import WorkThread
 
 from .log_messages import LogMessage, LogSink
 
@@ -62,7 +63,7 @@ def is_trusted(origin: str | None, named: Collection[str] = ()) -> bool:
     return bool(parts.scheme)
 
 
-class OriginGate:
+class OriginGate(WorkThread):
     """Accept viewers at a port, and connect those that are allowed to a server behind it.
 
     Foxglove's server accepts every origin, and browsers let any page connect to a port of the same machine.
@@ -98,23 +99,17 @@ class OriginGate:
         self.port = int(self._listening.getsockname()[1])
         self.refused = self.stalled = 0
         self._server, self._origins = server, frozenset(origins)
-        self._places, self._stopped = threading.Semaphore(MOST_VIEWERS), threading.Event()
+        self._places = threading.Semaphore(MOST_VIEWERS)
         self._asking: list[tuple[str, socket.socket]] = []
-        self._thread = threading.Thread(target=self._accept, daemon=True)
+        super().__init__(self._end)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
+    def _end(self) -> None:
         self._listening.close()
         if self.refused or self.stalled:
             told = "websocket: %d connections were refused, %d viewers took nothing"
             _LOG.warning(told, self.refused, self.stalled)
 
-    def _accept(self) -> None:
+    def _work(self) -> None:
         self._listening.settimeout(_POLL_S)
         while not self._stopped.is_set():
             try:

@@ -8,16 +8,14 @@ import logging
 import math
 import socket
 import struct
-import threading
 import time
 import uuid
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -25,6 +23,7 @@ from worldstate.adapters.files.file_io import FileOpener, GrowingFile, line_writ
 from worldstate.ground import FloatArray, InvalidArgumentError, seconds
 from worldstate.ground.checks import host_and_port
 from worldstate.ground.extras import check_extra, optional
+from worldstate.ground.threads import BoundedChannel, WorkThread
 from worldstate.state import Entity, WorldState
 from worldstate.state.sensor import Ego
 
@@ -489,8 +488,10 @@ TAKEN_S, AGAIN_S = 10.0, 1.0
 MOST_WAITING = 20
 
 
-class LiveSender:
+class LiveSender(WorkThread):
     """Send messages in a separate thread, so that no receiver can delay or end a run.
+
+    At the end it waits up to one second until the queued messages are sent.
 
     Parameters
     ----------
@@ -498,51 +499,37 @@ class LiveSender:
         Host and port of the receiver, for a new connection after it has disconnected.
     connection : socket
         The open connection to it.
-
-    Attributes
-    ----------
-    dropped : int
-        Number of dropped messages.
     """
 
     def __init__(self, target: tuple[str, int], connection: socket.socket) -> None:
         self._target, self._connection = target, connection
-        self._waiting, self.dropped = deque[bytes](maxlen=MOST_WAITING), 0
-        self._changed, self._stopped = threading.Condition(), threading.Event()
-        self._thread = threading.Thread(target=self._send, daemon=True)
+        self._waiting, self._failed = BoundedChannel[bytes](MOST_WAITING), 0
+        super().__init__(self._end, AGAIN_S)
+
+    @property
+    def dropped(self) -> int:
+        """Number of dropped messages."""
+        return self._waiting.dropped + self._failed
 
     def put(self, message: bytes) -> None:
         """Queue a message; if the queue is full, it replaces the oldest one."""
-        with self._changed:
-            self.dropped += len(self._waiting) == MOST_WAITING
-            self._waiting.append(message)
-            self._changed.notify()
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
+        self._waiting.put(message)
 
     def __exit__(self, *_: object) -> None:
-        """Wait up to one second until the queued messages are sent."""
-        with self._changed:
-            self._stopped.set()
-            self._changed.notify()
-        self._thread.join(AGAIN_S)
+        self._waiting.close()
+        super().__exit__()
+
+    def _end(self) -> None:
         self._connection.close()
         if self.dropped:
             _LOG.warning("%s:%d did not take %d messages", *self._target, self.dropped)
 
-    def _send(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._stopped.is_set())
-                if not self._waiting:
-                    return
-                message = self._waiting.popleft()
+    def _work(self) -> None:
+        while (message := self._waiting.take()) is not None:
             try:
                 self._connection.sendall(message)
             except OSError:  # the receiver has disconnected, or has received only part of a message
-                self.dropped += 1
+                self._failed += 1
                 self._connection.close()
                 if self._stopped.wait(AGAIN_S):
                     return

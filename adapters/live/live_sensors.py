@@ -10,12 +10,11 @@ import math
 import socket
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Generic, Self, TypeAlias, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -30,9 +29,8 @@ from worldstate.ground.checks import host_and_port
 from worldstate.ground.errors import OwnPartError
 from worldstate.ground.extras import optional
 from worldstate.ground.serialisation import decode, decode_json
+from worldstate.ground.threads import BoundedChannel, WorkThread
 from worldstate.ground.typing import ImageArray
-
-from .live_sound import BoundedChannel
 
 T = TypeVar("T")
 Sender: TypeAlias = tuple[str, int]
@@ -94,28 +92,7 @@ def _code(key: bytes, text: bytes) -> bytes:
     return hmac.new(key, text, "sha256").hexdigest().encode()
 
 
-class ReaderThread(ABC):
-    """A thread that reads while its context is open; `close` is called at the end."""
-
-    def __init__(self, close: Callable[[], object]) -> None:
-        self._close, self._stopped = close, threading.Event()
-        self._thread = threading.Thread(target=self._read, daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
-        self._close()
-
-    @abstractmethod
-    def _read(self) -> None:
-        """Read until `_stopped` is set."""
-
-
-class DatagramSocket(ReaderThread, Generic[T]):
+class DatagramSocket(WorkThread, Generic[T]):
     """Records that arrive as UDP datagrams of one JSON object, with ``"age_s"`` from capture to sending.
 
     If the object has a ``"number"``, numbers must increase. With a key, the HMAC-SHA256 of the object follows
@@ -256,7 +233,7 @@ class DatagramSocket(ReaderThread, Generic[T]):
             problem = f"expected a time within {CLOCKS_APART_S:g} s of now, got one {late_s:.3f} s ago"
             raise InvalidArgumentError(f"sent_s: {problem}")
 
-    def _read(self) -> None:
+    def _work(self) -> None:
         self._socket.settimeout(_POLL_S)
         while not self._stopped.is_set():
             try:
@@ -412,7 +389,7 @@ class ImageLooks:
             raise InvalidArgumentError(f"--camera: {problem}: give the lens of this camera")
 
 
-class CameraFeed(ReaderThread):
+class CameraFeed(WorkThread):
     """Read a camera of this computer into a channel until it is stopped.
 
     Parameters
@@ -438,7 +415,7 @@ class CameraFeed(ReaderThread):
             raise InputFileError(f"camera {device}", "expected a camera, but it cannot be opened")
         super().__init__(self._capture.release)
 
-    def _read(self) -> None:
+    def _work(self) -> None:
         while not self._stopped.is_set():
             found, image = self._capture.read()
             if not found:

@@ -40,43 +40,44 @@ def states(tmp_path_factory) -> Path:
         said = SequenceReading(np.stack([heard(coming), heard(0.01)]), SHARE, 0.2, SequenceAlarm(1.5, 20.0))
         look = Look("camera", hop * 10**8, Absent(0.1, 0.01))
         domain = Foreign("sounds like speech", 1.5) if hop > 10 else None
-        hop_ns = hop * 10**8
-        world = world.update(
-            Measurement(hop_ns, FLAT, look.answer, SILENT, SILENT, (), look, domain, sequence=said)
-        )
+        hop = Measurement(hop * 10**8, FLAT, look.answer, SILENT, SILENT, (), look, domain, sequence=said)
+        world = world.update(hop)
         lines.append(world.state.to_json())
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
 @pytest.fixture(scope="module")
-def onset(states: Path) -> int:
+def log(states: Path) -> list[WorldState]:
+    return [WorldState.from_json(line) for line in states.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def onset(log: list[WorldState]) -> int:
     """Return the number of the first hop with an advisory."""
-    log = [WorldState.from_json(line) for line in states.read_text().splitlines()]
     return next(hop for hop, state in enumerate(log, 1) if state.cues[0].advisory)
 
 
-def test_the_requested_budget_is_printed_beside_that_of_the_curve() -> None:
-    world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02))
-    promise = AlarmPromise(24.7, 9.1, 53.6, 0.0094, 0.0034, 0.0203)
-    for alarm, words in (
-        (SequenceAlarm(1.0, 20.0), "20 onsets per hour; the model file has no curve"),
-        (
-            SequenceAlarm(1.0, 25.0, None, promise),
-            "25 onsets per hour requested; the curve predicts 24.7 per hour "
-            "(9.1 to 53.6 at other junctions) and 0.9%",
-        ),
-        (
-            SequenceAlarm(1.0, 24.7, 0.01, promise),
-            "1.00% of the time without hazards requested; the curve predicts 24.7",
-        ),
-    ):
-        said = SequenceReading(np.stack([heard(0.1), heard(0.01)]), SHARE, 0.2, alarm)
-        state = world.update(Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, sequence=said)).state
-        line = next(one for one in common_lines(state) if one.startswith("budget: "))
-        assert words in line
-        stated = None if alarm.promise is None else 0.0094
-        assert [cue.alpha for cue in state.cues] == [stated, stated]
+CURVE = (
+    "25 onsets per hour requested; the curve predicts 24.7 per hour (9.1 to 53.6 at other junctions) and 0.9%"
+)
+PROMISE = AlarmPromise(24.7, 9.1, 53.6, 0.0094, 0.0034, 0.0203)
+
+
+@pytest.mark.parametrize(
+    ("alarm", "words"),
+    [
+        ((20.0,), "20 onsets per hour; the model file has no curve"),
+        ((25.0, None, PROMISE), CURVE),
+        ((24.7, 0.01, PROMISE), "1.00% of the time without hazards requested; the curve predicts 24.7"),
+    ],
+)
+def test_the_requested_budget_is_printed_beside_that_of_the_curve(alarm, words):
+    said = SequenceReading(np.stack([heard(0.1), heard(0.01)]), SHARE, 0.2, SequenceAlarm(1.0, *alarm))
+    hop = Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, sequence=said)
+    state = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02)).update(hop).state
+    assert words in next(one for one in common_lines(state) if one.startswith("budget: "))
+    assert {cue.alpha for cue in state.cues} == {None if len(alarm) == 1 else 0.0094}
 
 
 def test_low_recall_of_bicycles_is_printed() -> None:
@@ -123,9 +124,8 @@ def figures(state: WorldState) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(("hop", "said"), [(10, RAISED), (14, HELD)], ids=["raised", "held"])
-def test_explain_prints_the_causes_of_an_advisory(hop, said, states, capsys):
+def test_explain_prints_the_causes_of_an_advisory(hop, said, states, log, capsys):
     assert main(["explain", str(states), "--time", f"{hop / 10}", "--side", "left"]) == 0
-    log = [WorldState.from_json(line) for line in states.read_text().splitlines()]
     cue = log[hop - 1].cues[0]
     (entity,) = (one for one in log[hop - 1].entities if one.id == cue.entity_id)
     assert capsys.readouterr().out == PRINTED.format(
@@ -144,7 +144,7 @@ def test_explain_prints_the_causes_of_an_advisory(hop, said, states, capsys):
     )
 
 
-def test_without_a_time_all_advisories_are_listed(states, onset, capsys):
+def test_without_a_time_all_advisories_are_listed(states, log, onset, capsys):
     assert 7 <= onset <= 10  # During the approach, and not in the first hop
     assert main(["explain", str(states)]) == 0
     listed, explained = capsys.readouterr().out.split("\n\n")
@@ -155,19 +155,14 @@ def test_without_a_time_all_advisories_are_listed(states, onset, capsys):
     assert main(["explain", str(states), "--side", "right", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["advisories"] == []
-    snapshots = [json.loads(line) for line in states.read_text().splitlines()]
-    riskiest = max(snapshots, key=lambda snapshot: snapshot["cues"][1]["risk"])
-    assert told["time_s"] == riskiest["stamp_ns"] / 1e9
+    assert told["time_s"] == max(log, key=lambda state: state.cues[1].risk).time_s
 
 
 def test_explain_prints_why_there_is_no_advisory(states, onset, capsys):
     assert main(["explain", str(states), "--time", f"{onset / 10 - 0.12:.2f}", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["time_s"] == pytest.approx(onset / 10 - 0.1)
-    assert {side: one["standing"] for side, one in told["sides"].items()} == {
-        "left": "below",
-        "right": "below",
-    }
+    assert {one["standing"] for one in told["sides"].values()} == {"below"} and len(told["sides"]) == 2
     terms = told["sides"]["left"]["cue"]["evidence"]["terms_nats"]
     assert terms["prior"] == pytest.approx(np.log(0.4 / 0.6))  # Six of fifteen groups are within 3 s
     assert terms["sequence"] > 1.0 > 0.0 > told["sides"]["right"]["cue"]["evidence"]["compared_nats"]
@@ -237,10 +232,8 @@ def test_damaged_lines_are_skipped_with_one_notice(name, states, tmp_path, capfd
     log = tmp_path / "damaged.jsonl"
     log.write_bytes(b"".join(change(lines)))
     monkeypatch.setattr(logging.getLogger("worldstate.adapters.state_log"), "propagate", False)
-    for command in (
-        ["explain", str(log)],
-        ["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")],
-    ):
+    replay = ["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")]
+    for command in (["explain", str(log)], replay):
         assert main(command) == 0
         told = capfd.readouterr().err.splitlines()
         expected = f"damaged.jsonl: {cost} cut or damaged lines are left out"

@@ -10,10 +10,11 @@ import pytest
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.live.live_listening import live_steps
-from worldstate.adapters.live.live_sound import BoundedChannel, LiveSound, Playback, SoundBlock
+from worldstate.adapters.live.live_sound import LiveSound, Playback, SoundBlock
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
+from worldstate.ground.threads import BoundedChannel
 
 RATE, SECONDS = 8_000, 2.0
 

@@ -39,7 +39,6 @@ from worldstate.adapters.camera.detections import DetectionFilter, DetectionFram
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.live.live_sensors import DetectionSocket
-from worldstate.adapters.live.live_sound import BoundedChannel
 from worldstate.adapters.source import open_source
 from worldstate.core.budget_watch import RATES, BudgetWatch, Evidence
 from worldstate.frontend import FrontEnd, FrontEndSettings, GivenSpectra, MicrophoneArray, ovad_array
@@ -54,6 +53,7 @@ from worldstate.frontend.given_spectra import SpectrumFrontEnd
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.ground.errors import InvalidArgumentError, WorldstateError
 from worldstate.ground.serialisation import decode
+from worldstate.ground.threads import BoundedChannel
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement import (
     Approach,
