@@ -174,6 +174,8 @@ OPENING_TOP_M, FRAME_M = 2.25, 0.07
 FRAME: Colour = (196.0, 194.0, 188.0)
 SILL: Colour = (168.0, 164.0, 156.0)
 GLASS: Colour = (58.0, 66.0, 74.0)
+# Half width, lower edge, height of the sill, and colour of an opening.
+WINDOW, DOOR = (0.6, 0.95, 0.1, GLASS), (0.45, 0.0, 0.0, (70.0, 82.0, 78.0))
 
 
 def cell_noise(a: ArrayLike, b: ArrayLike, seed: int) -> Float32Array:
@@ -276,30 +278,15 @@ class Facade:
         doors = (storey < 1) & (cell_noise(bay, storey, self.seed + 1) < 0.3)
         drawn = cell_noise(bay + np.floor(1.5 * x), np.floor(0.7 * y), self.seed + 3) < 0.3
         mirrored = 0.75 + 0.5 * np.clip((y - 0.9) / 1.4, 0.0, 1.0)
-        for opening, here in ((WINDOW, ~doors), (DOOR, doors)):
-            half, low = opening.half_m, opening.low_m
+        for (half, low, sill, colour), here in ((WINDOW, ~doors), (DOOR, doors)):
             image[here & (np.abs(x) < half) & (y > low) & (y < OPENING_TOP_M)] = FRAME
             pane = here & (np.abs(x) < half - FRAME_M) & (np.abs(x) > 0.5 * FRAME_M)
             pane &= (y > low + FRAME_M) & (y < OPENING_TOP_M - FRAME_M)
-            image[pane] = tinted(opening.colour, mirrored * np.where(drawn, 1.5, 1.0))[pane]
-            image[here & (np.abs(x) < half + 0.08) & (y > low - opening.sill_m) & (y < low)] = SILL
+            image[pane] = tinted(colour, mirrored * np.where(drawn, 1.5, 1.0))[pane]
+            image[here & (np.abs(x) < half + 0.08) & (y > low - sill) & (y < low)] = SILL
         # Walls are darker at their foot, which receives less light from the sky.
         light = self.brightness * (0.72 + 0.28 * np.clip(up / 1.5, 0.0, 1.0))
         return np.asarray(image * light[..., None], np.float32)
-
-
-@dataclass(frozen=True, slots=True)
-class _Opening:
-    """An opening in a wall: half width, lower edge, height of the sill, and colour."""
-
-    half_m: float
-    low_m: float
-    sill_m: float
-    colour: Colour
-
-
-WINDOW = _Opening(0.6, 0.95, 0.1, GLASS)
-DOOR = _Opening(0.45, 0.0, 0.0, (70.0, 82.0, 78.0))
 
 
 ROAD_Z_M = -ARRAY_HEIGHT_M

@@ -1,7 +1,6 @@
 """Synthesis of speech, steps, bells, music, dogs, birds, shots, sirens, horns, tools and tones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -352,21 +351,13 @@ def _add_blast(
     _add(out, at_s, rate_hz, envelope * rng.standard_normal(len(time)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Song:
-    """Notes of a phrase (start and end in Hz, length in s), their number, and the rest after it."""
-
-    notes: tuple[tuple[float, float, float], ...]
-    repeats: tuple[int, int]
-    gap_s: float
-    rest_s: tuple[float, float]
-
-
 # A great tit's two notes, a house sparrow's chirps, a blackbird's whistles; pitches and lengths are assumed.
+# Each is the notes of a phrase (start and end in Hz, length in s), the range of its repetitions, the pause
+# between notes and the range of the rest after the phrases.
 SONGS = (
-    _Song(((5500.0, 5200.0, 0.11), (3900.0, 3700.0, 0.15)), (4, 9), 0.05, (1.0, 3.0)),
-    _Song(((3200.0, 5200.0, 0.03), (5200.0, 3400.0, 0.06)), (1, 6), 0.25, (0.5, 1.5)),
-    _Song(((2300.0, 2500.0, 0.18), (2700.0, 2250.0, 0.15), (2450.0, 3000.0, 0.2)), (1, 3), 0.04, (1.5, 3.0)),
+    (((5500.0, 5200.0, 0.11), (3900.0, 3700.0, 0.15)), (4, 9), 0.05, (1.0, 3.0)),
+    (((3200.0, 5200.0, 0.03), (5200.0, 3400.0, 0.06)), (1, 6), 0.25, (0.5, 1.5)),
+    (((2300.0, 2500.0, 0.18), (2700.0, 2250.0, 0.15), (2450.0, 3000.0, 0.2)), (1, 3), 0.04, (1.5, 3.0)),
 )
 WHISTLE_OVERTONES = (1.0, 0.1)
 TRANSPOSE = (0.95, 1.1)
@@ -376,17 +367,17 @@ def birds(samples: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     """Draw consecutive phrases of several birds, shape (samples,)."""
     out, at = np.zeros(samples), rng.uniform(0.0, 0.5)
     while at < samples / rate_hz:
-        song, pitch = SONGS[rng.integers(len(SONGS))], rng.uniform(*TRANSPOSE)
-        for _ in range(int(rng.integers(*song.repeats))):
-            for low, high, length in song.notes:
-                _add_note(out, at, rate_hz, (pitch * low, pitch * high, length))
-                at += length + song.gap_s
-        at += rng.uniform(*song.rest_s)
+        notes, repeats, gap_s, rest_s = SONGS[rng.integers(len(SONGS))]
+        pitch = rng.uniform(*TRANSPOSE)
+        for _ in range(int(rng.integers(*repeats))):
+            for low, high, length in notes:
+                _add_note(out, at, rate_hz, pitch * low, pitch * high, length)
+                at += length + gap_s
+        at += rng.uniform(*rest_s)
     return out
 
 
-def _add_note(out: FloatArray, at_s: float, rate_hz: float, note: tuple[float, float, float]) -> None:
-    begin, end, length = note
+def _add_note(out: FloatArray, at_s: float, rate_hz: float, begin: float, end: float, length: float) -> None:
     first = int(at_s * rate_hz)
     count = min(int(length * rate_hz), len(out) - first)
     if count > 0:

@@ -1,8 +1,9 @@
 """Propagation of moving sources along all paths to all microphones, which may move as well."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -20,20 +21,14 @@ from .static_field import PlacedSource, StreetSound
 BLEND_M = 0.02  # Length of the detour over which a line that touches a body becomes the path round it
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OpenImage:
-    """A source in the open, or its mirror image in a wall, and the bodies between it and the array."""
-
-    x_m: FloatArray  # shape (T,): Position of the source or image
-    y_m: FloatArray
-    # shape (T, 8): Amplitude after the wall, per octave; 0 without a reflection.
-    gain: FloatArray
-    occluders: tuple[OccludingBody, ...]
+# Position (x, y) of a source in the open or of its mirror image in a wall, (T,) each; its amplitude after the
+# wall, 0 without a reflection, (T, 1); and the bodies between it and the array.
+OpenImage: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, tuple[OccludingBody, ...]]
 
 
 def open_images(site: Site, x_m: FloatArray, y_m: FloatArray, ego_x_m: FloatArray) -> list[OpenImage]:
     """Return a source and its first-order images in the walls of the site's bodies."""
-    images = [OpenImage(x_m, y_m, np.ones((len(y_m), 1)), site.occluders)]
+    images: list[OpenImage] = [(x_m, y_m, np.ones((len(y_m), 1)), site.occluders)]
     for body in site.occluders:
         for wall in walls(body):
             weight = wall.reflects(x_m, y_m, (ego_x_m, 0.0))
@@ -43,19 +38,14 @@ def open_images(site: Site, x_m: FloatArray, y_m: FloatArray, ego_x_m: FloatArra
                 others = [one for one in site.occluders if one is not body]
                 behind = map(wall.mirrored_body, others)
                 gain = site.side_reflection * weight[:, None]
-                images.append(OpenImage(*wall.mirrored(x_m, y_m), gain, (*others, *behind)))
+                images.append((*wall.mirrored(x_m, y_m), gain, (*others, *behind)))
     return images
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScreenedLeg:
-    """Sound past one point, or straight, at a series of emission times."""
-
-    # shape (T,): Horizontal distance from the source to that point; 0 for the straight line.
-    before_m: FloatArray
-    via_x_m: FloatArray  # shape (T,): Position of that point, or of the source itself
-    via_y_m: FloatArray
-    gain: FloatArray  # shape (T, 8): Amplitude per octave; 0 if this path does not apply
+# Horizontal distance from a source to a point that its sound passes, 0 for the straight line; position (x, y)
+# of that point, or of the source itself, (T,) each; and the amplitude per octave, 0 if this path does not
+# apply, (T, 8).
+ScreenedLeg: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def screened_legs(
@@ -63,20 +53,20 @@ def screened_legs(
 ) -> list[ScreenedLeg]:
     """Return the straight path and the detours round the corners of the body with the largest detour."""
     if not occluders:
-        return [ScreenedLeg(np.zeros_like(y_m), x_m, y_m, np.ones((len(y_m), len(OCTAVES_HZ))))]
+        return [(np.zeros_like(y_m), x_m, y_m, np.ones((len(y_m), len(OCTAVES_HZ))))]
     # At each time one body is used; the bodies behind it change little.
     found = [detours(one, x_m, y_m, (ego_x_m, 0.0)) for one in occluders]
     worst = np.argmax([detour for detour, _ in found], axis=0)
     detour = np.max([one for one, _ in found], axis=0)
     gain = 10.0 ** (-screen_attenuation_db(detour[:, None], OCTAVES_HZ, cap_db) / 20.0)
     blocked = smooth_step(detour / BLEND_M)
-    legs = [ScreenedLeg(np.zeros_like(y_m), x_m, y_m, gain * (1.0 - blocked)[:, None])]
+    legs = [(np.zeros_like(y_m), x_m, y_m, gain * (1.0 - blocked)[:, None])]
     for body, (occluder, (_, chosen)) in enumerate(zip(occluders, found, strict=True)):
         for index, (x, y) in enumerate(occluder.corners_m):
             here = blocked * ((worst == body) & (chosen == index))
             if here.any():
                 corner = np.full_like(y_m, x), np.full_like(y_m, y)
-                legs.append(ScreenedLeg(np.hypot(x_m - x, y_m - y), *corner, gain * here[:, None]))
+                legs.append((np.hypot(x_m - x, y_m - y), *corner, gain * here[:, None]))
     return legs
 
 
@@ -195,22 +185,24 @@ def _add_open(street: StreetSound, source: PlacedSource) -> None:
     receiver, cap_db = street.receiver, street.preset.screen_cap_db
     flat = source.y_m**2 + receiver.above(source.height_m) ** 2
     _, heard_x = receiver.arrivals(source.emission.knots_s, partial(_slant, source.x_m, flat))
-    for image in open_images(street.site, source.x_m, source.y_m, heard_x):
-        straight = np.sqrt((image.x_m - heard_x) ** 2 + image.y_m**2 + receiver.above(source.height_m) ** 2)
-        gain = image.gain * media_gain(straight, source, receiver)
-        for leg in screened_legs(image.occluders, image.x_m, image.y_m, heard_x, cap_db):
-            _add_leg(street.static.out, source, replace(leg, gain=leg.gain * gain), receiver)
+    for x, y, reflected, occluders in open_images(street.site, source.x_m, source.y_m, heard_x):
+        straight = np.sqrt((x - heard_x) ** 2 + y**2 + receiver.above(source.height_m) ** 2)
+        gain = reflected * media_gain(straight, source, receiver)
+        for before, via_x, via_y, screened in screened_legs(occluders, x, y, heard_x, cap_db):
+            leg = before, via_x, via_y, screened * gain
+            _add_leg(street.static.out, source, leg, receiver)
 
 
 def _add_leg(out: Float32Array, source: PlacedSource, leg: ScreenedLeg, receiver: Receiver) -> None:
     """Add the sound that reaches every microphone past one point, or straight."""
+    before, via_x, via_y, gain = leg
 
     def travel(position: FloatArray) -> FloatArray:
-        along, across = leg.via_x_m - position[0], leg.via_y_m - position[1]
-        length = partial(_round, leg.before_m, along, across, position[2] - source.height_m)
+        along, across = via_x - position[0], via_y - position[1]
+        length = partial(_round, before, along, across, position[2] - source.height_m)
         return receiver.arrivals(source.emission.knots_s, length)[0]
 
-    add_to_all(out, source.emission, leg.gain, travel, receiver)
+    add_to_all(out, source.emission, gain, travel, receiver)
 
 
 def _round(

@@ -85,17 +85,15 @@ class Spectrogram:
         window = np.hanning(FFT_SAMPLES).astype(np.float32)
         blocks = whole[:cut].reshape(-1, frames, FFT_SAMPLES) * window
         for block in blocks:
-            self._lines.append((np.abs(rfft(block, axis=-1)) ** 2).mean(axis=0)[self._shown])
+            power = (np.abs(rfft(block, axis=-1)) ** 2).mean(axis=0)
+            self._lines.append(power[1 : 1 + len(self.frequencies_hz)])
         self._rest = whole[cut:]
 
     @property
-    def _shown(self) -> slice:
-        return slice(1, int(np.searchsorted(rfftfreq(FFT_SAMPLES, 1.0 / self.sample_rate_hz), HIGHEST_HZ)))
-
-    @property
     def frequencies_hz(self) -> FloatArray:
-        """Middle of the bins, shape (F,)."""
-        return np.asarray(rfftfreq(FFT_SAMPLES, 1.0 / self.sample_rate_hz)[self._shown])
+        """Middle of the bins, without that at 0 Hz, shape (F,)."""
+        every = rfftfreq(FFT_SAMPLES, 1.0 / self.sample_rate_hz)
+        return np.asarray(every[1 : np.searchsorted(every, HIGHEST_HZ)])
 
     @property
     def times_s(self) -> FloatArray:
