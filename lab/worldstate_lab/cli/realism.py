@@ -26,7 +26,6 @@ Examples
 
 import argparse
 from collections.abc import Mapping
-from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,11 +52,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-LABELS = {
-    "width_deg": "width (deg)",
-    "position_deg": "position of the peak (deg)",
-    "prominence": "prominence",
-}
+LABELS = {"width_deg": "width (deg)", "position_deg": "position of the peak (deg)"}
 COLOURS = {"real": TRUTH, "simulated": CATEGORIES[1]}
 
 
@@ -76,7 +71,11 @@ def write_realism_figure(
             axes.set_title(f"{windows} windows")
         for half, axes in enumerate(rows[-1][:2]):
             _draw_profiles(axes, found, half)
-        _draw_key(rows[-1][2])
+        key = rows[-1][2]
+        for origin, colour in COLOURS.items():
+            key.plot([], [], "o-", color=colour, label=origin)
+        key.axis("off")
+        key.legend(loc="center", title="median, central 50 and 90 % of windows;\none line per junction below")
 
 
 def _draw_measure(
@@ -99,13 +98,8 @@ def _draw_measure(
         axes.set_xscale("log")
         axes.minorticks_off()
         axes.xaxis.set_major_formatter("{x:.3g}")
-        axes.set_xticks(_ticks(axes))
-
-
-def _ticks(axes: "Axes") -> FloatArray:
-    """Return four ticks of two digits, evenly spaced in the logarithm; decades would give one or none."""
-    low, high = axes.get_xlim()
-    return np.array([float(f"{value:.1e}") for value in np.geomspace(low, high, 6)[1:-1]])
+        # Four ticks of two digits, evenly spaced in the logarithm; decades would give one or none.
+        axes.set_xticks([float(f"{value:.1e}") for value in np.geomspace(*axes.get_xlim(), 6)[1:-1]])
 
 
 def _values(table: FeatureTable, site: str, windows: str, name: str) -> FloatArray:
@@ -119,15 +113,7 @@ def _draw_profiles(axes: "Axes", found: Realism, half: int) -> None:
         for profile in by_site.values():
             axes.plot(FAR_AZIMUTHS_DEG, profile[half], color=colour, linewidth=1.0, alpha=0.7)
     axes.axhline(0.0, color="grey", linewidth=0.8)
-    axes.set(xlabel="azimuth (deg)", ylabel="far side louder (log)")
-    axes.set_title(f"half {half + 1} of the window")
-
-
-def _draw_key(axes: "Axes") -> None:
-    for origin, colour in COLOURS.items():
-        axes.plot([], [], "o-", color=colour, label=origin)
-    axes.axis("off")
-    axes.legend(loc="center", title="median, central 50 and 90 % of windows;\none line per junction below")
+    axes.set(xlabel="azimuth (deg)", ylabel="far side louder (log)", title=f"half {half + 1} of the window")
 
 
 Pair = tuple[FeatureTable, FeatureTable | None]
@@ -159,13 +145,8 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     pairs = _simulated(arguments, real)
     simulated = {name: right for name, (right, _) in pairs.items()}
     permuted = {name: wrong for name, (_, wrong) in pairs.items() if wrong is not None}
-    found = measure_realism(
-        real,
-        simulated,
-        np.random.default_rng(SEEDS[0]),
-        permuted=permuted,
-        classifiers=not arguments.measures_only,
-    )
+    rng, classifiers = np.random.default_rng(SEEDS[0]), not arguments.measures_only
+    found = measure_realism(real, simulated, rng, permuted=permuted, classifiers=classifiers)
     report: dict[str, object] = {"group": arguments.group, **found.to_dict()}
     if arguments.out is not None:
         write_report(arguments.out / "realism.json", report)
@@ -174,7 +155,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
 
 
 def _chosen(path: Path, arguments: argparse.Namespace) -> FeatureTable:
-
     table = read_features(path).group(arguments.group)
     if arguments.sites is None:
         return table
@@ -189,21 +169,20 @@ def _simulated(arguments: argparse.Namespace, real: FeatureTable) -> dict[str, P
     if arguments.real_only:
         return {}
     if arguments.simulated:
-        if len(arguments.permuted or arguments.simulated) != len(arguments.simulated):
+        wrong = arguments.permuted or [None] * len(arguments.simulated)
+        if len(wrong) != len(arguments.simulated):
             raise InvalidArgumentError("--permuted: expected as many tables as for --simulated")
-        tables = zip_longest(arguments.simulated, arguments.permuted or ())
         return {
-            right.stem: (_chosen(right, arguments), None if wrong is None else _chosen(wrong, arguments))
-            for right, wrong in tables
+            right.stem: (_chosen(right, arguments), None if other is None else _chosen(other, arguments))
+            for right, other in zip(arguments.simulated, wrong, strict=True)
         }
     # The junctions of a moving ego are those of the table; other sites have no real counterpart.
     sites = sorted(set(real.environments.tolist()))
     found: dict[str, Pair] = {}
     with progress_bar("simulating windows", 4 * WINDOWS * len(sites) * len(SEEDS)) as bar:
         for seed in SEEDS:
-            pair = simulated_window_pair(
-                WINDOWS, seed, sites=sites, jobs=arguments.jobs, progress=bar.advance
-            )
+            options = {"sites": sites, "jobs": arguments.jobs, "progress": bar.advance}
+            pair = simulated_window_pair(WINDOWS, seed, **options)
             found[f"seed {seed}"] = pair
             if arguments.out is not None:
                 for name, table in zip(("windows", "permuted"), pair, strict=True):

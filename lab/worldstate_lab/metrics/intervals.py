@@ -22,7 +22,7 @@ from worldstate.abduction.cueing.risk_map import BINS
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc, poisson_interval
 from worldstate.operations.training.training import recording_labels
 
@@ -312,35 +312,6 @@ def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) ->
     values, labels, names = np.asarray(scores), np.asarray(positive), np.asarray(groups)
     areas = {str(name): auroc(values[names == name], labels[names == name]) for name in np.unique(names)}
     return {name: area for name, area in areas.items() if area is not None}
-
-
-def macro(by_group: Mapping[str, float]) -> float:
-    """Return the mean over groups.
-
-    Examples
-    --------
-    >>> macro({"SA1": 1.0, "SB1": 0.5})
-    0.75
-    """
-    if not by_group:
-        raise InvalidArgumentError("groups: expected at least one with hazard and hazard-free windows")
-    return float(np.mean(list(by_group.values())))
-
-
-def worst_rate(alarms: BoolArray, hazard_free: BoolArray, sites: AnyArray) -> float:
-    r"""Return the share of hazard-free windows in alarm at the junction where it is largest.
-
-    .. math:: \max_s \frac{\sum_i a_i f_i [s_i = s]}{\sum_i f_i [s_i = s]}
-
-    Shapes: alarms, hazard_free, sites (n,).
-
-    Examples
-    --------
-    >>> free = np.ones(4, dtype=bool)
-    >>> worst_rate(np.array([True, False, False, False]), free, np.array([0, 0, 1, 1]))
-    0.5
-    """
-    return max(float(alarms[hazard_free & (sites == one)].mean()) for one in np.unique(sites[hazard_free]))
 
 
 def worst_group(values: Mapping[str, float], worse: Literal["low", "high"]) -> tuple[str, float]:
