@@ -141,7 +141,10 @@ def run_protocol(
                 said[method.name] |= {i: decide(trial) for i, trial in zip(tested, after, strict=True)}
         passes.append(said)
     rows = sorted(next(iter(passes[0].values())))
-    decisions = {name: tuple(tuple(one[name][i] for i in rows) for one in passes) for name in passes[0]}
+    decisions = {
+        name: tuple(tuple(one[name][i] for i in rows) for one in passes)
+        for name in (method.name for method in methods)
+    }
     trained_on = classifiers.trained_on(protocol.trained_on) if classifiers else ""
     return ProtocolRun(protocol, tuple(trials[i] for i in rows), decisions, used, trained_on)
 

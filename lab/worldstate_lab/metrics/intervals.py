@@ -22,7 +22,7 @@ from worldstate.abduction.cueing.risk_map import BINS
 from worldstate.adapters.datasets.feature_table import FeatureTable
 from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc, poisson_interval
 from worldstate.operations.training.training import recording_labels
 
@@ -299,18 +299,18 @@ def calibration_error_sampling(
     return float(errors.mean()), float(errors.std())
 
 
-def auroc_by_group(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike) -> dict[str, float]:
+def auroc_by_group(scores: FloatArray, positive: BoolArray, groups: AnyArray) -> dict[str, float]:
     """Return the area of each group that has both labels, sorted by name.
 
     Shapes: scores, positive (n,), groups (n,).
 
     Examples
     --------
-    >>> auroc_by_group([0.1, 0.9, 0.5], [False, True, True], ["a", "a", "b"])
+    >>> scores, positive = np.array([0.1, 0.9, 0.5]), np.array([False, True, True])
+    >>> auroc_by_group(scores, positive, np.array(["a", "a", "b"]))
     {'a': 1.0}
     """
-    values, labels, names = np.asarray(scores), np.asarray(positive), np.asarray(groups)
-    areas = {str(name): auroc(values[names == name], labels[names == name]) for name in np.unique(names)}
+    areas = {str(name): auroc(scores[groups == name], positive[groups == name]) for name in np.unique(groups)}
     return {name: area for name, area in areas.items() if area is not None}
 
 
