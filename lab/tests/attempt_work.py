@@ -1,6 +1,5 @@
 """A small pass over sound files, kept in a cache, for tests that send it to other processes."""
 
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,9 +47,3 @@ def write_sounds(folder, n, seconds=2):
     for path in paths:
         soundfile.write(path, rng.uniform(-0.5, 0.5, (seconds * 8000, 16)), 8000, "PCM_24")
     return paths
-
-
-def end_at_one(item):
-    """End the process in the middle of its work, as the kernel does when memory is exhausted."""
-    if item == 1:
-        os._exit(9)

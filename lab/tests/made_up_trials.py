@@ -17,9 +17,8 @@ def made_up(name, label="none", *, t0_s=5.0, hops=81, site="SA1", fingerprint=""
     }
     about = {"site": site, "fingerprint": fingerprint or name, **about}
     hops_table = HopTable(columns, name, label, np.nan if label == "none" else t0_s, about)
-    boxes = [
-        (i, time_s[i], (0.0, 0.0, 1.0, 1.0), 1.0, "car", in_view_rad, True) for i in np.flatnonzero(seen)
-    ]
+    box = (0.0, 0.0, 1.0, 1.0), 1.0, "car", in_view_rad, True
+    boxes = [(i, time_s[i], *box) for i in np.flatnonzero(seen)]
     truth = [(moment, 0, in_view_rad, there) for moment, there in zip(time_s, seen, strict=True)]
     return Trial(
         hops_table,

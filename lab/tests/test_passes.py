@@ -52,6 +52,7 @@ from worldstate.commissioning.heard_stream import (
 )
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.frontend.array.microphone_array import ovad_array
+from worldstate.operations.metrics.approach_table import Figures
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.state import SideShare
@@ -118,11 +119,19 @@ def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
     return measured
 
 
+def passed(vehicles: list[Vehicle], duration_s: float = 60.0) -> PassedStream:
+    """Return a stream with the beliefs of the filter."""
+    made_up = stream(vehicles, duration_s)
+    return PassedStream(made_up, stream_truth(made_up), followed(WorldFilter(Context()), heard(made_up)))
+
+
+def figures_of(vehicles: list[Vehicle], duration_s: float = 60.0) -> Figures:
+    return pass_figures([passed(vehicles, duration_s)])
+
+
 @pytest.mark.long
 def test_a_vehicle_raises_an_advisory_only_before_it_is_seen_and_keeps_its_identity() -> None:
-    made_up = stream([("left", "left", 12.0), ("right", "right", 26.0), ("from_ahead", "left", 40.0)])
-    follow = followed(WorldFilter(Context()), heard(made_up))
-    told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
+    told = figures_of([("left", "left", 12.0), ("right", "right", 26.0), ("from_ahead", "left", 40.0)])
     assert (told["approaches"], told["detected"], told["other_side_too"]) == (2, 1.0, 0.0)
     assert (told["identity_judged"], told["identity_kept"]) == (2, 1.0)
     # The sequence reports "coming" for another 0.4 s after T0: this is the vehicle that the camera detects.
@@ -134,17 +143,13 @@ def test_a_vehicle_raises_an_advisory_only_before_it_is_seen_and_keeps_its_ident
 
 @pytest.mark.long
 def test_two_simultaneous_vehicles_are_two_entities_and_a_car_ahead_is_neither() -> None:
-    made_up = stream([("both", "left", 15.0), ("both", "right", 15.8), ("from_ahead", "left", 9.5)])
-    follow = followed(WorldFilter(Context()), heard(made_up))
-    told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
+    told = figures_of([("both", "left", 15.0), ("both", "right", 15.8), ("from_ahead", "left", 9.5)])
     assert (told["both_sides_found"], told["phantom_third"]) == (1.0, 0.0)
     assert (told["identity_kept"], told["took_hidden_identity"]) == (1.0, 0.0)
 
 
 def test_undefined_figures_of_a_street_without_approaches_are_none() -> None:
-    made_up = stream([("from_ahead", "left", 12.0)], duration_s=30.0)
-    follow = followed(WorldFilter(Context()), heard(made_up))
-    told = pass_figures([PassedStream(made_up, stream_truth(made_up), follow)])
+    told = figures_of([("from_ahead", "left", 12.0)], duration_s=30.0)
     assert (told["onsets_per_hour"], told["detected"], told["time_rmse_of_constant"]) == (0.0, None, None)
     json.dumps(told, allow_nan=False)
 
@@ -159,9 +164,8 @@ def stated(made_up: HeardStream, chance: float, *, masked: bool = False) -> Pass
     none = np.zeros((n, 2), bool)
     within, times = np.full((n, 2, 4), chance), np.full((n, 2, 3), np.nan)
     heard_all, nothing = (np.full(n, masked), np.zeros(n, bool)), ((),) * n
-    follow = FollowedStream(
-        made_up.hops.time_s, none, none * 0.0, within, times, *heard_all, nothing, frozenset(), ()
-    )
+    columns = made_up.hops.time_s, none, none * 0.0, within, times, *heard_all
+    follow = FollowedStream(*columns, nothing, frozenset(), ())
     return PassedStream(made_up, stream_truth(made_up), follow)
 
 
@@ -206,10 +210,8 @@ def test_second_vehicles_are_scored_at_the_base_rate_of_the_street() -> None:
 
 @pytest.mark.long
 def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
-    made_up = stream([*PAIR, ("queue", "left", 30.0), ("follows", "left", 33.0), *SINGLES[1:]])
-    follow = followed(WorldFilter(Context()), heard(made_up))
-    passed = PassedStream(made_up, stream_truth(made_up), follow)
-    told = second_figures([passed])
+    whole = passed([*PAIR, ("queue", "left", 30.0), ("follows", "left", 33.0), *SINGLES[1:]])
+    follow, told = whole.followed, second_figures([whole])
     group = "other, 1.5 to 4 s"
     assert (told[f"{group}: stated apart"], told[f"{group}: merged"]) == (1, 0.0)
     assert told[f"{group}: identity kept"] == 1.0
@@ -219,11 +221,11 @@ def test_a_second_vehicle_is_kept_apart_from_the_first() -> None:
         tuple(replace(one, sides=shares) for one in hop if one.status == "hidden" and one.direction == "left")
         for hop in follow.entities
     )
-    unknown = PassedStream(made_up, passed.truth, replace(follow, entities=single))
+    unknown = replace(whole, followed=replace(follow, entities=single))
     assert second_figures([unknown])[f"{group}: stated apart"] == 0
     # An entity that ends in another one is a merge, whatever is detected later.
     ids = frozenset(one.id for hop in follow.entities for one in hop)
-    merged = PassedStream(made_up, passed.truth, replace(follow, merged=ids))
+    merged = replace(whole, followed=replace(follow, merged=ids))
     assert second_figures([merged])[f"{group}: merged"] == 1.0
 
 
@@ -301,15 +303,10 @@ def test_the_guard_acts_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
     """A guard that classifies everything as foreign reduces evidence and `heard`, as in `AcousticAdapter`."""
     made_up, rng = stream([("left", "left", 12.0)], duration_s=16.0), np.random.default_rng(1)
     n = len(made_up.hops)
-    refused = dict.fromkeys(
-        ("bearing_rad", "bearing_std_rad", "looming_hz", "looming_std_hz"), np.full(n, np.nan)
-    )
-    fully = {
-        "heard": np.ones(n),
-        "unheard": np.full(n, ""),
-        "excess_db": np.zeros(n),
-        "prominence": np.ones(n),
-    }
+    names = "bearing_rad", "bearing_std_rad", "looming_hz", "looming_std_hz"
+    refused = dict.fromkeys(names, np.full(n, np.nan))
+    fully = dict.fromkeys(("heard", "prominence"), np.ones(n))
+    fully |= {"unheard": np.full(n, ""), "excess_db": np.zeros(n)}
     feature, energy = rng.uniform(0.1, 1.0, (n, 60)), rng.normal(size=(n, 16))
     hops = made_up.hops.replace(feature=feature, band_log_energy=energy, **refused, **fully)
     replace(made_up, hops=hops).save(tmp_path / "stream.npz")

@@ -107,9 +107,8 @@ def test_the_areas_do_not_depend_on_the_order_of_the_sets():
 
 def test_windows_without_a_class_are_compared_by_the_other_classes():
     table = windows(np.random.default_rng(10))
-    found = measure_realism(
-        table, {"made": table.select(table.labels != "front")}, np.random.default_rng(0), classifiers=False
-    )
+    made = {"made": table.select(table.labels != "front")}
+    found = measure_realism(table, made, np.random.default_rng(0), classifiers=False)
     assert {one.windows for one in found.rows if one.figure.startswith("AUROC")} == {"hidden", "none"}
 
 
@@ -117,11 +116,8 @@ def test_side_accuracy_uses_other_junctions_and_is_chance_with_shuffled_labels()
     rng = np.random.default_rng(6)
     table = windows(rng, n=60)
     assert min(side_accuracy(table, table).values()) > 0.9
-    shuffled = FeatureTable(
-        table.features,
-        np.concatenate([rng.permutation(table.labels[:120]), table.labels[120:]]),
-        *(table.ids, table.environments, table.recordings, table.t0_frames),
-    )
+    labels = np.concatenate([rng.permutation(table.labels[:120]), table.labels[120:]])
+    shuffled = replace(table, labels=labels)
     assert 0.3 < np.mean(list(side_accuracy(shuffled, shuffled).values())) < 0.7
 
 
@@ -129,8 +125,7 @@ def test_the_mirrored_street_has_the_same_side():
     """With left and right exchanged in features and labels, accuracy and odd profile are the same."""
     table = windows(np.random.default_rng(7))
     swapped = np.select([table.labels == "left", table.labels == "right"], ["right", "left"], table.labels)
-    about = table.ids, table.environments, table.recordings, table.t0_frames
-    mirrored = FeatureTable(mirror_features(table.features), swapped, *about)
+    mirrored = replace(table, features=mirror_features(table.features), labels=swapped)
     assert side_accuracy(table, mirrored) == side_accuracy(table, table)
     for site, profile in odd_profiles(table).items():
         np.testing.assert_allclose(odd_profiles(mirrored)[site], profile, atol=1e-12)
@@ -144,19 +139,15 @@ def test_the_share_between_sites_is_that_of_their_offsets():
     offsets = dict(zip(PLACES, rng.normal(0.0, 0.2, (len(PLACES), 60)), strict=True))
     noise = rng.normal(0.0, 0.2, (1600, 60))
     levels = noise + np.array([offsets[name] for name in table.environments])
-    about = table.labels, table.ids, table.environments, table.recordings, table.t0_frames
-    figures = set_figures(FeatureTable(np.exp(levels), *about))
+    figures = set_figures(replace(table, features=np.exp(levels)))
     assert figures["between-site share of pattern", "none"] == pytest.approx(0.43, abs=0.06)
     assert figures["sd of pattern", "none"] == pytest.approx(0.26, abs=0.02)
 
 
 def test_junctions_are_grouped_so_that_both_halves_contain_both_types():
     assert len(halves(["SA1", "SA2", "SB1", "SB2", "SB3"])) == 6
-    assert [str(one) for one in halves(["DA1", "DB1", "DB2"])] == [
-        "DA1 | DB1 DB2",
-        "DB1 | DA1 DB2",
-        "DB2 | DA1 DB1",
-    ]
+    uneven = [str(one) for one in halves(["DA1", "DB1", "DB2"])]
+    assert uneven == ["DA1 | DB1 DB2", "DB1 | DA1 DB2", "DB2 | DA1 DB1"]
 
 
 def test_a_set_without_hazards_is_rejected():
@@ -263,16 +254,14 @@ def test_the_command_compares_given_windows_with_a_table(tmp_path, capsys):
     write_features(tmp_path / "made.csv", made)
     write_features(tmp_path / "wrong.csv", made)
     words = ["realism", str(tmp_path / "real.csv"), "--sites", "SA1", "SB1", "--json"]
-    given = [*words, "--simulated", str(tmp_path / "made.csv"), "--out", str(tmp_path / "r")]
-    given += ["--permuted", str(tmp_path / "wrong.csv")]
-    assert main(given) == 0
+    given = {"simulated": "made.csv", "permuted": "wrong.csv", "out": "r"}
+    assert main([*words, *(word for k, v in given.items() for word in (f"--{k}", str(tmp_path / v)))]) == 0
     report = json.loads(capsys.readouterr().out)
     assert json.loads((tmp_path / "r" / "realism.json").read_text()) == report
     assert report["groupings"] == ["SA1 | SB1"]
     assert {name for one in report["rows"] for name in one["simulated"]} == {"made"}
-    assert [
-        one["simulated"]["made"] > 0.9 for one in report["rows"] if one["figure"].startswith("transfer")
-    ] == [True] * 2
+    transfers = [one["simulated"]["made"] for one in report["rows"] if one["figure"].startswith("transfer")]
+    assert len(transfers) == 2 and min(transfers) > 0.9
     # With the same features twice, the positions cause no loss, which misses the requirement.
     lost = [one for one in report["rows"] if one["figure"] == "loss by permuted positions: shipped model"]
     assert [(one["simulated"], one["met"]) for one in lost] == [({"made": 0.0}, {"made": False})]
@@ -302,11 +291,10 @@ def test_the_command_simulates_the_junctions_of_a_table(group, sites, tmp_path, 
     assert pair[0].labels.tolist() == pair[1].labels.tolist()
     given = [*words, "--simulated", str(tmp_path / "r" / "windows-4.csv"), "--measures-only"]
     assert main(given) == 0
-    again = {
-        (one["figure"], one["windows"]): one["simulated"]
-        for one in json.loads(capsys.readouterr().out)["rows"]
-    }
-    first = {(one["figure"], one["windows"]): one["simulated"] for one in report["rows"]}
+    first, again = (
+        {(one["figure"], one["windows"]): one["simulated"] for one in found["rows"]}
+        for found in (report, json.loads(capsys.readouterr().out))
+    )
     assert again["sd of log level", "none"] == {"windows-4": first["sd of log level", "none"]["seed 4"]}
 
 

@@ -75,9 +75,8 @@ def test_every_hop_of_hazard_free_recordings_counts() -> None:
 
 
 def test_hops_of_a_cut_start_are_not_counted() -> None:
-    whole, cut = (
-        leads(one, [x.hops.time_s for x in one], None, draw()) for one in (corner(), corner(start_s=2))
-    )
+    kinds = corner(), corner(start_s=2)
+    whole, cut = (leads(one, [x.hops.time_s for x in one], None, draw()) for one in kinds)
     assert [whole[lead]["approaches"] for lead in ("2", "3")] == [4, 4]
     assert [cut[lead]["approaches"] for lead in ("2", "3")] == [4, 0]
     assert cut["3"]["hazard_free"] == 0

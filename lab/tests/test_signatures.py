@@ -88,9 +88,8 @@ def test_another_gain_shifts_the_threshold_but_not_the_area():
     rng = np.random.default_rng(2)
     home, away = (drawn(rng, recordings=10, clips=20, lift=3.0) for _ in range(2))
     louder = replace(away, energy=away.energy + 9.0)
-    by_level, by_shape = (
-        scores_of(louder, transferred(home, louder, by), louder.motor) for by in ("level", "shape")
-    )
+    found = (transferred(home, louder, by) for by in ("level", "shape"))
+    by_level, by_shape = (scores_of(louder, score, louder.motor) for score in found)
     assert area(by_level) > 0.99
     assert balanced_accuracy(by_level) == 0.5, "everything is called a vehicle"
     unmoved = scores_of(away, transferred(home, away, "shape"), away.motor)

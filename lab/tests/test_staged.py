@@ -1,13 +1,13 @@
 """Staged videos of a corner, searched by a simple detector, and counts of its boxes; needs no recording."""
 
 import json
-from itertools import chain
+from itertools import chain, product
 
 import cv2
 import numpy as np
 import pytest
 from worldstate_lab.cli.main import main
-from worldstate_lab.degradation.conditions import Condition
+from worldstate_lab.degradation.conditions import FAMILIES, Condition
 from worldstate_lab.metrics.intervals import stratified_draws
 from worldstate_lab.sequences import staged_video
 from worldstate_lab.sequences.recordings import read_boxes, read_recordings
@@ -49,11 +49,8 @@ class Bright:
 def folder(tmp_path_factory):
     """Two junctions with an approach and a hazard-free recording each, in the layout of the recordings."""
     folder = tmp_path_factory.mktemp("corner")
-    rows = [
-        (f"{name}{site}", site, side)
-        for site in ("SA1", "SB3")
-        for name, side in (("a", "left"), ("n", "none"))
-    ]
+    kinds = product(("SA1", "SB3"), (("a", "left"), ("n", "none")))
+    rows = [(f"{name}{site}", site, side) for site, (name, side) in kinds]
     lines = [f"{name},{site},{side},{T0},4.0," for name, site, side in rows]
     (folder / "truth.csv").write_text("\n".join(["id,junction,side,t0_s,seconds,entry_exit", *lines]) + "\n")
     for place in ("video", "boxes"):
@@ -81,9 +78,7 @@ def write_recording(folder, name, approach):
 
 @pytest.fixture(scope="module")
 def staging(folder, tmp_path_factory):
-    states = tuple(
-        Condition(family, level) for family in ("blur", "darkness", "noise") for level in (1, 2, 3, 4)
-    )
+    states = [Condition(family, level) for family in FAMILIES for level in (1, 2, 3, 4)]
     staging = Staging(tmp_path_factory.mktemp("staged"), "nanodet", Bright, 2, (CLEAN, *states))
     for recording in read_recordings(folder):
         assert stage_recording(staging, recording) == 13 * IMAGES / 2

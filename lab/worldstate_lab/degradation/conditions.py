@@ -38,7 +38,6 @@ from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import Video
 from worldstate.adapters.source import Source
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.extras import optional
 from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.ground.values import nanoseconds
@@ -314,8 +313,7 @@ def health_of(readings: Sequence[HopTable]) -> CameraHealth:
 
 def degradation_in(readings: HopTable, condition: str, rates: MissRates) -> DegradationLog:
     """Return d as estimated from the camera's own images, without knowledge of the staged degradation."""
-    if rates.health is None:
-        raise InvalidArgumentError("rates: expected miss rates with the camera's scale of health")
+    assert rates.health is not None  # `pooled_rates` measures it
     monitor, chosen = HealthMonitor(rates.health), readings.condition == condition
     stamps_ns = [nanoseconds(time_s) for time_s in readings.time_s[chosen].tolist()]
     columns = (readings.columns[name][chosen].tolist() for name in _READING_COLUMNS[2:])

@@ -14,7 +14,6 @@ from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.adapters.datasets.ovad import Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.source import open_source
-from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.ground.serialisation import encode
 from worldstate.ground.typing import BoolArray
@@ -39,47 +38,33 @@ from .staged_filter import Camera, by_condition, filter_in_conditions
 LEAST = 2
 
 
-@dataclass(frozen=True, slots=True)
-class SweepData:
-    """Recordings of a sweep, and descriptions of recordings that are missing."""
-
-    approaches: tuple[Recording, ...]
-    hazard_free: tuple[Recording, ...]
-    missing: tuple[str, ...]
-
-    @property
-    def recordings(self) -> tuple[Recording, ...]:
-        """Approaches and hazard-free recordings."""
-        return *self.approaches, *self.hazard_free
-
-    @property
-    def lacks(self) -> str | None:
-        """The data that a sweep needs and that are missing; None if it can be run."""
-        if min(len(self.approaches), len(self.hazard_free)) >= LEAST:
-            return None
-        least = f"needs {LEAST} approaches and {LEAST} hazard-free recordings with video"
-        return f"{least}; {'; '.join(self.missing)}"
-
-
-def sweep_data(recordings: Sequence[Recording], approaches: int = 12, hazard_free: int = 12) -> SweepData:
+def sweep_data(
+    recordings: Sequence[Recording], approaches: int = 12, hazard_free: int = 12
+) -> tuple[list[Recording], list[str]]:
     """Choose recordings with video and a standing ego of each kind, evenly over junctions and sides.
+
+    The result has the recordings, approaches first, and descriptions of those that are missing.
 
     Examples
     --------
-    >>> sweep_data([], approaches=2, hazard_free=0).missing
-    ('2 of 2 approaches with video are missing',)
+    >>> try:
+    ...     sweep_data([], approaches=2, hazard_free=0)
+    ... except InvalidArgumentError as error:
+    ...     print(str(error).partition("; ")[2])
+    2 of 2 approaches with video are missing
     """
-    of_kind = [[one for one in recordings if (one.label == "none") == free] for free in (False, True)]
-    names = "approaches", "hazard-free recordings"
-    wanted = approaches, hazard_free
-    filmed = [[one for one in found if _usable(one)] for found in of_kind]
-    missing = [
-        f"{number - len(usable)} of {number} {name} with video are missing" + _why(found)
-        for name, number, usable, found in zip(names, wanted, filmed, of_kind, strict=True)
-        if len(usable) < number
-    ]
-    chosen, free = (tuple(_evenly(usable, number)) for usable, number in zip(filmed, wanted, strict=True))
-    return SweepData(chosen, free, tuple(missing))
+    chosen, missing = [], []
+    kinds = ("approaches", approaches, False), ("hazard-free recordings", hazard_free, True)
+    for name, number, free in kinds:
+        found = [one for one in recordings if (one.label == "none") == free]
+        usable = [one for one in found if _usable(one)]
+        chosen.append(_evenly(usable, number))
+        if len(usable) < number:
+            missing.append(f"{number - len(usable)} of {number} {name} with video are missing{_why(found)}")
+    if min(map(len, chosen)) < LEAST:
+        least = f"{LEAST} approaches and {LEAST} hazard-free recordings with video"
+        raise InvalidArgumentError(f"recordings: a sweep needs {least}; {'; '.join(missing)}")
+    return chosen[0] + chosen[1], missing
 
 
 def _usable(recording: Recording) -> bool:
@@ -123,7 +108,7 @@ class DegradationSettings:
     Parameters
     ----------
     detectors : tuple of StagedDetector
-        Detectors run in every condition; by default two kinds of background subtraction.
+        Detectors with unique names, run in every condition; by default two kinds of background subtraction.
     model : Path, optional
         Signature model; by default the shipped one.
     approaches, hazard_free : int
@@ -133,11 +118,6 @@ class DegradationSettings:
         further.
     seed : int
         Seed of noise, folds and intervals.
-
-    Raises
-    ------
-    InvalidArgumentError
-        If a number is out of range or two detectors have the same name.
 
     Examples
     --------
@@ -151,12 +131,6 @@ class DegradationSettings:
     hazard_free: int = 12
     width_px: int = 640
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        names = {one.name for one in self.detectors}
-        if not names or len(names) < len(self.detectors) or READINGS in names:
-            raise InvalidArgumentError(f"detectors: expected unique names, got {sorted(names)}")
-        in_range("width_px", self.width_px, 64, 8192)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -282,12 +256,10 @@ def degradation_study(
     recordings: a sweep needs 2 approaches and 2 hazard-free recordings with video
     """
     chosen = settings or DegradationSettings()
-    data = sweep_data(recordings, chosen.approaches, chosen.hazard_free)
-    if data.lacks is not None:
-        raise InvalidArgumentError(f"recordings: a sweep {data.lacks}")
-    passes = _Passes(chosen, {one.recording_id: fingerprint(one.path) for one in data.recordings}, keep)
+    used, missing = sweep_data(recordings, chosen.approaches, chosen.hazard_free)
+    passes = _Passes(chosen, {one.recording_id: fingerprint(one.path) for one in used}, keep)
     rng, skipped = np.random.default_rng(chosen.seed), dict[str, str]()
-    seen = _done(over, passes.look, [SweepItem(one) for one in data.recordings], skipped)
+    seen = _done(over, passes.look, [SweepItem(one) for one in used], skipped)
     counts = [{name: counts_of(one.tables[f"{name} misses"]) for name in passes.names} for one in seen]
     sites = [str(one.recording.environment) for one in seen]
     folds = deal_folds([str(one.recording.label) for one in seen], sites, rng)
@@ -310,7 +282,7 @@ def degradation_study(
 
     names = {free: tuple(str(one) for one in believed if one.hazard_free == free) for free in (False, True)}
     sweeps = tuple(sweep(name) for name in passes.names)
-    return DegradationStudy(sweeps, names[False], names[True], skipped, data.missing, chosen)
+    return DegradationStudy(sweeps, names[False], names[True], skipped, tuple(missing), chosen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from worldstate.operations.metrics.approach_table import AFTER_S
 from worldstate.simulation.camera.simulated_detector import BOX_NOISE_PX, inside, miss_rate, project
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import VehicleKind, vehicle_kind
-from worldstate.state import Entity, WorldState
+from worldstate.state import Entity, RiskCue, WorldState
 from worldstate.state.context import Context
 from worldstate.state.cue import Tally
 
@@ -142,13 +142,12 @@ def followed(
         world = world.update(measurement)
         learn_passes(street, world.state)
         states.append(world.state)
-    cues = [sorted(state.cues, key=lambda cue: SIDES.index(cue.direction)) for state in states]
-    nothing, never = [np.nan] * len(HORIZONS_S), [np.nan] * 3
+    cues, never = list(map(cues_of, states)), [np.nan] * 3
     return FollowedStream(
         time_s=np.array([state.stamp_ns for state in states]) * 1e-9,
         advisory=np.array([[cue.advisory is not None for cue in hop] for hop in cues]),
         risk=np.array([[cue.risk for cue in hop] for hop in cues]),
-        within=np.array([[list((cue.within or {}).values()) or nothing for cue in hop] for hop in cues]),
+        within=np.array([list(map(chances, hop)) for hop in cues]),
         time_to_visible_s=np.array([[cue.time_to_visible_s or never for cue in hop] for hop in cues]),
         masked=np.array([any(one.reason for one in state.heard or ()) for state in states]),
         unheard=np.array([all(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]),
@@ -156,6 +155,16 @@ def followed(
         merged=frozenset(one.entity_id for state in states for one in state.events if one.kind == "merged"),
         tallies=tuple(Tally() if state.budget is None else state.budget.tally for state in states),
     )
+
+
+def cues_of(state: WorldState) -> list[RiskCue]:
+    """Return the cues of the left and of the right side."""
+    return sorted(state.cues, key=lambda cue: SIDES.index(cue.direction))
+
+
+def chances(cue: RiskCue) -> list[float]:
+    """Return the chances of coming into view by horizon, NaN if the cue has none."""
+    return list((cue.within or {}).values()) or [np.nan] * len(HORIZONS_S)
 
 
 CameraKind = Literal["all", "cars", "none", "dies"]

@@ -51,6 +51,7 @@ from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.simulation.scene.octave_bands import REFERENCE_PA
 from worldstate.simulation.stream.rendering import SILENCE_PA2, band_filter
 from worldstate.state import Entity
+from worldstate_lab.trials.listening import nearest_entity
 
 from .followed_stream import PassedStream
 
@@ -127,15 +128,9 @@ def _true_azimuth(heard: HeardStream, vehicle: int, time_s: float) -> float | No
 def seen_at(stream: PassedStream, vehicle: int, hop: int) -> Entity | None:
     """Return the entity in view at the position of a vehicle, None if there is none."""
     azimuth = _true_azimuth(stream.heard, vehicle, float(stream.followed.time_s[hop]))
-    if azimuth is None:
-        return None
-    near = [
-        (abs(wrap_angle(one.azimuth_rad - azimuth)), one.id, one)
-        for one in stream.followed.entities[hop]
-        if one.status == "visible" and one.existence_probability >= EXISTS
-    ]
-    distance, _, nearest = min(near, default=(np.inf, "", None))
-    return nearest if distance <= NEAR_RAD else None
+    likely = (one for one in stream.followed.entities[hop] if one.existence_probability >= EXISTS)
+    there = [one for one in likely if one.status == "visible"]
+    return None if azimuth is None else nearest_entity(there, azimuth, NEAR_RAD)
 
 
 def pass_figures(streams: Sequence[PassedStream]) -> Figures:

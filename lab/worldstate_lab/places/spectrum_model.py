@@ -235,17 +235,16 @@ class SpectrumModel:
         -------
         SpectrumModel
         """
-        azimuths = finite_array("azimuths_rad", azimuths_rad, (None,))
-        frequencies = finite_array("frequencies_hz", frequencies_hz, (None,))
+        hz, azimuths = frequencies_hz, azimuths_rad
         along = np.arange(-FARTHEST_M, FARTHEST_M + 0.5 * STEP_M, STEP_M)
-        beams = _responses(array, frequencies, azimuths, _ARRIVALS_RAD)
+        beams = _responses(array, hz, azimuths, _ARRIVALS_RAD)
         # All frequencies are in one matrix product: separate products took 12 s instead of 1.
-        beams = np.ascontiguousarray(beams.transpose(0, 2, 1)).reshape(-1, len(azimuths)) / len(frequencies)
-        diffuse = _responses(array, frequencies, azimuths, _ALL_ROUND_RAD).mean(axis=2) / len(frequencies)
-        metric = _metric(_responses(array, frequencies, azimuths, azimuths).mean(axis=0))
+        beams = np.ascontiguousarray(beams.transpose(0, 2, 1)).reshape(-1, len(azimuths)) / len(hz)
+        diffuse = _responses(array, hz, azimuths, _ALL_ROUND_RAD).mean(axis=2) / len(hz)
+        metric = _metric(_responses(array, hz, azimuths, azimuths).mean(axis=0))
         templates, heard = [], []
         for draw in _draws(draws):
-            by_azimuth = _arriving(walls, along, frequencies, draw)
+            by_azimuth = _arriving(walls, along, hz, draw)
             ambience = 10.0 ** (draw[3] / 10.0)
             arriving = by_azimuth.sum(axis=2)  # shape (N, F)
             shares = by_azimuth / (arriving + ambience)[:, :, None]
@@ -275,9 +274,8 @@ class SpectrumModel:
         """
         values = finite_array("spectrum", spectrum, (len(self.metric),))
         if np.ptp(values) == 0.0:
-            raise InvalidArgumentError(
-                f"spectrum: expected values that differ over azimuth, got only {values[0]:g}"
-            )
+            got = f"got only {values[0]:g}"
+            raise InvalidArgumentError(f"spectrum: expected values that differ over azimuth, {got}")
         # The scale is arbitrary. Values are centred first, because a large offset would reduce precision.
         alike = np.clip(self.templates @ _directions((values - values.mean()) @ self.metric), 0.0, MOST_ALIKE)
         by_path = (1.0 - alike**2) ** (-0.5 * FREEDOM)

@@ -25,6 +25,7 @@ from worldstate_lab.evaluation.ablation_rows import (
     evaluate_ablation,
 )
 from worldstate_lab.metrics.intervals import deal_folds, middle, pooled_share, stratified_draws
+from worldstate_lab.trials.pass_cache import ALPHA
 
 from .hearing import Chain, heard
 from .recordings import CornerRecording
@@ -94,9 +95,8 @@ def statistic_rows(
     streams: Sequence[HopTable], prior: Sequence[float], seed: int, switches: AblationSwitches
 ) -> dict[str, dict[str, float | None]]:
     """Return the rows of the paper's statistic: each part off, the camera fully trusted, eq. (5) on."""
-    trusted = [one.replace(miss_rate=np.full(len(one), _NEVER)) for one in streams]
     changed = {
-        "vision_trusted": trusted,
+        "vision_trusted": [one.replace(miss_rate=np.full(len(one), _NEVER)) for one in streams],
         "eq_5": [one.replace(log_likelihoods=one.grounded) for one in streams],
         "eq_5_without_rate": [one.replace(log_likelihoods=one.rateless) for one in streams],
     }
@@ -107,52 +107,45 @@ def statistic_rows(
     return {**ablation_table(streams, prior, seed, switches), **rows}
 
 
-def product_row(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float = 0.02) -> Figures:
+def product_row(streams: Sequence[HopTable], rng: np.random.Generator) -> Figures:
     """Return the figures of the published states of recordings.
 
     `aware` is the share of the hops from T0 to the last image with the vehicle in which an object is
-    detected, or P(hidden) + P(visible) is above the threshold that a share alpha of hazard-free hops exceeds
-    (five folds). `vision_only` is the share in which an object is detected.
+    detected, or P(hidden) + P(visible) is above the threshold that 2 % of the hazard-free hops exceed (five
+    folds). `vision_only` is the share in which an object is detected.
     """
     approaches = [one for one in streams if not one.hazard_free]
     free = [one for one in streams if one.hazard_free]
     alarms = {one.name: np.asarray(one.advised.any(axis=1), bool) for one in streams}
     outcomes = [onset_outcome(one.time_s[rising_edges(alarms[one.name])], one.t0_s) for one in approaches]
     found = ApproachTable(outcomes, [alarms[one.name] for one in free]).figures()
-    aware = _aware(streams, rng, alpha)
+    aware = _aware(streams, rng)
+    in_view = [(one, one.after_sight()) for one in approaches]
+    hits = np.array([aware[one.name][there].sum() for one, there in in_view])
+    draws = stratified_draws([str(one.about["site"]) for one in approaches], rng)
+    share, drawn = pooled_share(hits, np.array([there.sum() for _, there in in_view]), draws)
     sites = sorted({str(one.about["site"]) for one in free})
     by_site = {site: [aware[one.name] for one in free if one.about["site"] == site] for site in sites}
-    in_view = {one.name: one.after_sight() for one in approaches}
     return {
         "warned": sum(one.detected for one in outcomes),
         "approaches": len(approaches),
         "lead_s": found["lead_s"],
         "onsets": sum(len(rising_edges(alarms[one.name])) for one in free),
         "advisory_share": found["hazard_free_share"],
-        **_aware_of(approaches, aware, rng),
-        "vision_only": mean_of(np.concatenate([one.seen[in_view[one.name]] for one in approaches])),
+        **{"aware": share, "aware_low": middle(drawn)[0], "aware_high": middle(drawn)[1]},
+        "vision_only": mean_of(np.concatenate([one.seen[there] for one, there in in_view])),
         **{f"hazard_free_aware_{site}": mean_of(np.concatenate(some)) for site, some in by_site.items()},
     }
 
 
-def _aware_of(some: Sequence[HopTable], aware: Mapping[str, BoolArray], rng: np.random.Generator) -> Figures:
-    """Return the share of aware hops with the vehicle in view, with its interval over some."""
-    in_view = [one.after_sight() for one in some]
-    hits = np.array([aware[one.name][seen].sum() for one, seen in zip(some, in_view, strict=True)])
-    hops = np.array([seen.sum() for seen in in_view])
-    draws = stratified_draws([str(one.about["site"]) for one in some], rng)
-    share, drawn = pooled_share(hits, hops, draws)
-    return {"aware": share, "aware_low": middle(drawn)[0], "aware_high": middle(drawn)[1]}
-
-
-def _aware(streams: Sequence[HopTable], rng: np.random.Generator, alpha: float) -> dict[str, BoolArray]:
+def _aware(streams: Sequence[HopTable], rng: np.random.Generator) -> dict[str, BoolArray]:
     """Return the aware hops of each recording, with thresholds from the other folds."""
     sites = [str(one.about["site"]) for one in streams]
     folds = deal_folds([one.label for one in streams], sites, rng).tolist()
     found = {}
     for fold in set(folds):
         others = [one for one, at in zip(streams, folds, strict=True) if at != fold and one.hazard_free]
-        gamma = neyman_pearson_threshold([_presence(one) for one in others], alpha)
+        gamma = neyman_pearson_threshold([_presence(one) for one in others], ALPHA)
         for one, at in zip(streams, folds, strict=True):
             if at == fold:
                 found[one.name] = np.asarray(one.seen.astype(bool) | (_presence(one) >= gamma))

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import COLUMNS, SIDES
-from worldstate.abduction.sequence.sequence_model import GROUPS, HORIZONS_S
+from worldstate.abduction.sequence.sequence_model import GROUPS
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.camera.detections import DetectionLog
 from worldstate.adapters.camera.miss_rates import MissRates
@@ -25,7 +25,7 @@ from worldstate.adapters.source import ListenSettings, Source, open_source
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate.state import RiskCue, WorldState
+from worldstate_lab.passes.followed_stream import chances, cues_of
 from worldstate_lab.trials.listening import (
     box_table,
     columns_of,
@@ -165,7 +165,7 @@ def heard(chain: Chain, recording: CornerRecording) -> Trial:
 
 def _product_row(step: Step) -> tuple[FloatArray, ...]:
     state, measured = step.state, step.measurement
-    cues = [cue_of(state, side) for side in SIDES]
+    cues = cues_of(state)
     sides, reading = measured.signature.sides, measured.sequence
     history = step.checkpoint.history
     priors = cues[0].hypotheses
@@ -180,15 +180,3 @@ def _product_row(step: Step) -> tuple[FloatArray, ...]:
         reading.groups if isinstance(reading, SequenceReading) else _NO_READING,
         history.recent[-1] if history is not None and history.hops else np.full(len(COLUMNS), np.nan),
     )
-
-
-def cue_of(state: WorldState, side: str) -> RiskCue:
-    """Return the cue of a side."""
-    return next(one for one in state.cues if one.direction == side)
-
-
-def chances(cue: RiskCue) -> list[float]:
-    """Return the chances of coming into view by horizon, NaN if the cue has none."""
-    if cue.within is None:
-        return [np.nan] * len(HORIZONS_S)
-    return [cue.within[f"{horizon:g}"] for horizon in HORIZONS_S]

@@ -26,7 +26,7 @@ from worldstate.state import Entity, WorldState
 from worldstate_lab.methods.oc_sort import OcSort
 from worldstate_lab.metrics.intervals import middle, pooled_draws
 from worldstate_lab.metrics.track_measures import gated_median_deg, gospa_bearing
-from worldstate_lab.trials.listening import box_table, frame_row, likely_movers, reference_rad
+from worldstate_lab.trials.listening import box_table, frame_row, likely_movers, nearest_entity, reference_rad
 
 from .hearing import Chain
 from .recordings import CornerRecording
@@ -80,7 +80,8 @@ def tracked(chain: Chain, recording: CornerRecording) -> Tracked | None:
     vision = source.camera_channel()
     boxes = box_table(source, vision)
     vehicle = [one for one in _vehicle(boxes, recording) if _number(one.time_s) in steps]
-    found = [_standing_for(steps[_number(one.time_s)].state, one) for one in vehicle]
+    there = [(one.middle_rad, _there(steps[_number(one.time_s)].state, "visible")) for one in vehicle]
+    found = [nearest_entity(entities, azimuth, NEAR_RAD) for azimuth, entities in there]
     delays_s = (one.time_s - vehicle[0].time_s for one, entity in zip(vehicle, found, strict=True) if entity)
     return Tracked(
         recording,
@@ -117,12 +118,6 @@ def _vehicle(boxes: HopTable, recording: CornerRecording) -> list[AzimuthBox]:
 
 def _there(state: WorldState, status: str) -> list[Entity]:
     return [one for one in likely_movers(state) if one.status == status]
-
-
-def _standing_for(state: WorldState, box: AzimuthBox) -> Entity | None:
-    near = [(abs(wrap_angle(e.azimuth_rad - box.middle_rad)), e.id, e) for e in _there(state, "visible")]
-    apart, _, entity = min(near, default=(math.inf, "", None))
-    return entity if apart <= NEAR_RAD else None
 
 
 def _identity(steps: Mapping[int, Step], found: Sequence[Entity | None], recording: CornerRecording) -> str:

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from worldstate.abduction.sequence.sequence_inputs import SIDES
 from worldstate.adapters.acoustic import Grounding, asked_again, observe
 from worldstate.adapters.listener import Step
 from worldstate.adapters.source import Source
@@ -22,10 +21,11 @@ from worldstate.core.filter import WorldFilter
 from worldstate.ground.parallel import in_processes
 from worldstate.measurement.measurement import Measurement
 from worldstate.operations.recordings.hop_table import HopTable
+from worldstate_lab.passes.followed_stream import chances, cues_of
 from worldstate_lab.report.table import Table, Value
 from worldstate_lab.trials.trial import Trial
 
-from .hearing import Chain, chances, cue_of
+from .hearing import Chain
 from .recordings import CornerRecording
 from .scores import Row, alarm_row, calibration, curve, leads
 
@@ -56,8 +56,7 @@ class WindowFilter:
         for step in steps:
             measurement = self.measured(step, camera)
             world = world.predict_to(measurement.stamp_ns).update(measurement)
-            cues = [cue_of(world.state, side) for side in SIDES]
-            said = [(one.risk, chances(one), one.advisory is not None) for one in cues]
+            said = [(one.risk, chances(one), one.advisory is not None) for one in cues_of(world.state)]
             rows.append((measurement.stamp_ns * 1e-9, *map(np.array, zip(*said, strict=True))))
         hops = HopTable.of_rows(("time_s", "risk", "within", "advised"), rows)
         about = {"site": recording.junction, "leads_from_s": recording.t0_s}

@@ -185,7 +185,6 @@ LAYOUT = 4
 # (0.1 s), a moving ego's delay (0.5 s) and the front window's delay (1.5 s).
 ENTRY_S, DURATION_S = 1.65, 3.8
 FRAME_S = 1.0 / FRAME_RATE_HZ
-MAX_PER_CLASS = 1000
 # Any permutation is suitable, but it must be the same for all seeds, so that they share one array.
 PERMUTATION = 56
 
@@ -210,7 +209,6 @@ def simulated_window_pair(
     progress: Callable[[], None] = lambda: None,
 ) -> tuple[FeatureTable, FeatureTable]:
     """Simulate windows of junctions: their features, and the features with permuted microphone positions."""
-    in_range("per_approach", per_approach, 1, MAX_PER_CLASS)
     in_range("jobs", jobs, 1, 256)
     rows = []
     work = partial(windows_of_recording, preset() if levels is None else levels)

@@ -32,9 +32,9 @@ from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequ
 from worldstate.frontend.stream import AcousticFrame
 from worldstate.ground.errors import OutOfDomainError
 from worldstate.ground.typing import AnyArray, BoolArray, Float32Array, FloatArray
-from worldstate.ground.values import NotUsable, nanoseconds, seconds
+from worldstate.ground.values import NotUsable, nanoseconds, seconds, wrap_angle
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, hop_stream
-from worldstate.state import Entity, RiskCue, WorldState
+from worldstate.state import Entity, WorldState
 from worldstate_lab.metrics.stream_statistic import stream_statistic
 
 from .trial import (
@@ -226,7 +226,9 @@ def _decided(state: WorldState) -> tuple[Any, ...]:
     nats = max((cue.evidence.compared_nats for cue in state.cues if cue.evidence), default=np.nan)
     score = 1.0 / (1.0 + np.exp(-nats))
     side = SIDES.get(told.direction or "", NO_SIDE) if raised and told is not None else NO_SIDE
-    return state.time_s, bool(raised), side, _bearing(state), score, state.risk, _visible(told)
+    horizon_s = np.nan if told is None or told.horizon_s is None else told.horizon_s
+    visible_s = np.nan, horizon_s, np.nan
+    return state.time_s, bool(raised), side, _bearing(state), score, state.risk, visible_s
 
 
 def _bearing(state: WorldState) -> float:
@@ -242,10 +244,11 @@ def likely_movers(state: WorldState) -> list[Entity]:
     return [one for one in state.entities if one.moving and one.existence_probability >= LIKELY]
 
 
-def _visible(cue: RiskCue | None) -> tuple[float, float, float]:
-    """Return the predicted time to visible with its interval; NaN if there is none."""
-    horizon_s = None if cue is None else cue.horizon_s
-    return (np.nan, np.nan if horizon_s is None else horizon_s, np.nan)
+def nearest_entity(entities: Iterable[Entity], azimuth_rad: float, most_rad: float) -> Entity | None:
+    """Return the entity nearest to an azimuth, None if all are farther than a limit."""
+    apart = [(abs(wrap_angle(one.azimuth_rad - azimuth_rad)), one.id, one) for one in entities]
+    distance, _, nearest = min(apart, default=(np.inf, "", None))
+    return nearest if distance <= most_rad else None
 
 
 def box_table(source: Source, vision: VisionQuery) -> HopTable:
