@@ -12,8 +12,7 @@ from worldstate.abduction.co_evidence import Unqueried
 from worldstate.abduction.road_users import ClassShares
 from worldstate.belief.kinematics.motion import FARTHEST_M, LEAST_STD
 from worldstate.ground import FloatArray, replaced, wrap_angle
-from worldstate.measurement import CameraLook, Sector
-from worldstate.measurement.position import Position, PositionScan
+from worldstate.measurement import CameraLook, Position, PositionScan, Sector
 
 from .site_geometry import SiteGeometry
 from .street_model import StreetModel

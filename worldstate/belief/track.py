@@ -22,9 +22,8 @@ from worldstate.belief.kinematics.motion import (
     predict,
     relax,
 )
-from worldstate.ground import BoolArray, FloatArray, wrap_angle
+from worldstate.ground import BoolArray, FloatArray, IntArray, wrap_angle
 from worldstate.ground.serialisation import FLAT, Count, Keys, Probability
-from worldstate.ground.typing import IntArray
 from worldstate.ground.values import Answer
 
 from .site_geometry import IN_VIEW, SiteGeometry, normal_shares

@@ -13,8 +13,7 @@ from worldstate.belief.kinematics.motion import (
 )
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import merged
-from worldstate.ground import TINY, FloatArray
-from worldstate.ground.values import NotUsable
+from worldstate.ground import TINY, FloatArray, NotUsable
 from worldstate.measurement.measurement import Bearing, Measurement
 
 from .birth_death import HIDDEN

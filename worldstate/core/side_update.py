@@ -4,8 +4,7 @@ from collections.abc import Iterable
 
 from worldstate.abduction.co_evidence import Unqueried
 from worldstate.belief.street_model import StreetModel
-from worldstate.ground import LEAST_HEARD, falling
-from worldstate.ground.values import NotUsable, replaced
+from worldstate.ground import LEAST_HEARD, NotUsable, falling, replaced
 from worldstate.measurement import CameraLook, Heard, Measurement
 from worldstate.state.sensor import MASKED
 
