@@ -173,17 +173,6 @@ def test_class_probabilities_sum_to_at_most_one():
     assert replace(THERE, classes=(("van", 0.6), ("car", 0.4))).classes == (("car", 0.4), ("van", 0.6))
 
 
-def test_lists_and_single_precision_are_accepted():
-    sides = SideEvidence(("left", "right"), (np.float32(1.0), 0), np.float32(0.5), 0, np.float32(2.0))
-    told = SignatureEvidence(["left", "right"], [4.0, 0.0], 2.0, 0.0, sides)
-    plain = SideEvidence(("left", "right"), (1.0, 0.0), 0.5, 0.0, 2.0)
-    worlds = [WorldFilter().update(measured(1, signature=one)) for one in (told, replace(told, sides=plain))]
-    assert worlds[0].state == worlds[1].state
-    assert json.dumps(worlds[0].to_dict()) == json.dumps(worlds[1].to_dict())
-    with pytest.raises(InvalidArgumentError, match="direct: expected a finite number, got nan"):
-        replace(sides, direct=math.nan)
-
-
 def test_the_largest_stamp_gives_a_readable_state():
     last_ns = 2**63 - 3600 * 10**9
     for world in (WorldFilter().update(measured(1, stamp_ns=last_ns)), WorldFilter().predict_to(last_ns)):
@@ -193,19 +182,22 @@ def test_the_largest_stamp_gives_a_readable_state():
         WorldFilter(start_ns=last_ns).predict(1.0)
 
 
-def test_integers_and_numpy_numbers_are_accepted():
+def test_lists_integers_and_numpy_numbers_are_accepted():
+    sides = SideEvidence(("left", "right"), (np.float32(1.0), 0), np.float32(0.5), 0, np.float32(2.0))
+    plain_sides = SideEvidence(("left", "right"), (1.0, 0.0), 0.5, 0.0, 2.0)
+    told = SignatureEvidence(["left", "right"], [4, np.float32(0)], np.int64(2), 0, sides)
+    usual = SignatureEvidence(("left", "right"), (4.0, 0.0), 2.0, 0.0, plain_sides)
+    numbers = {"signature": told, "co_evidence": Absent(np.float64(0.04))}
+    boxes = (CAR,), (replace(CAR, score=np.float64(0.9)),)
     plain, other = WorldFilter(), WorldFilter()
     for at in range(1, 30):
-        numbers = {
-            "stamp_ns": np.int64(at * 10**8),
-            "signature": SignatureEvidence(("left", "right"), (4, np.float32(0)), np.int64(2), 0),
-            "co_evidence": Absent(np.float64(0.04)),
-            "sightings": (replace(CAR, score=np.float64(0.9)),) if at > 20 else (),
-        }
-        plain = plain.update(measured(at, sightings=(CAR,) if at > 20 else ()))
-        other = other.update(measured(at, **numbers))
+        mine, its = boxes if at > 20 else ((), ())
+        plain = plain.update(measured(at, signature=usual, sightings=mine))
+        other = other.update(measured(at, stamp_ns=np.int64(at * 10**8), sightings=its, **numbers))
     assert other.state.to_json() == plain.state.to_json()
     assert json.dumps(other.to_dict()) == json.dumps(plain.to_dict())
+    with pytest.raises(InvalidArgumentError, match="direct: expected a finite number, got nan"):
+        replace(sides, direct=math.nan)
 
 
 def test_heard_is_optional_in_a_record():
