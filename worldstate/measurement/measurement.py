@@ -1,7 +1,6 @@
 """Measurements: evidence of one modality at one instant, and the protocols of a modality."""
 
 import math
-import sys
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -11,12 +10,11 @@ from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.road_users import ClassShares, DomainVerdict, class_shares
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.ground.checks import all_of, check_fields, in_range, named, pair
+from worldstate.ground.checks import ABOVE_ZERO, MOST, all_of, check_fields, in_range, named, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 from worldstate.ground.values import LEAST_HEARD, NotUsable, integer_ns
 
-_ABOVE_ZERO, _MOST = math.ulp(0.0), sys.float_info.max
-_AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (_ABOVE_ZERO, 1e3)
+_AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (ABOVE_ZERO, 1e3)
 _SIGHTING = {
     "azimuth_rad": _AZIMUTHS_RAD,
     "std_rad": _STDS_RAD,
@@ -61,9 +59,7 @@ class Bearing:
     at_edge: bool = field(default=False, metadata=ADDED)
 
     def __post_init__(self) -> None:
-        check_fields(
-            self, azimuth_rad=_AZIMUTHS_RAD, std_rad=_STDS_RAD, prominence=(0.0, _MOST), at_edge=bool
-        )
+        check_fields(self, azimuth_rad=_AZIMUTHS_RAD, std_rad=_STDS_RAD, prominence=(0.0, MOST), at_edge=bool)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +88,7 @@ class Approach:
     std_hz: float
 
     def __post_init__(self) -> None:
-        check_fields(self, inverse_tta_hz=(-1e3, 1e3), std_hz=(_ABOVE_ZERO, 1e6))
+        check_fields(self, inverse_tta_hz=(-1e3, 1e3), std_hz=(ABOVE_ZERO, 1e6))
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,11 +4,10 @@ import math
 from dataclasses import dataclass
 
 from worldstate.ground import integer_ns, named, wrap_angle
-from worldstate.ground.checks import check_fields, pair
+from worldstate.ground.checks import ABOVE_ZERO, check_fields, pair
 
 FARTHEST_M = 1e8  # UTM's northings go up to 1e7
 _MOST_TURNS_RAD = 1e6  # Large enough for a localiser that does not wrap its yaw
-_ABOVE_ZERO = math.ulp(0.0)
 _RANGES = {
     "speed_mps": (-100.0, 100.0),
     "yaw_rate_rad_s": (-10.0, 10.0),
@@ -46,7 +45,7 @@ class EgoPose:
         check_fields(self, yaw_rad=(-_MOST_TURNS_RAD, _MOST_TURNS_RAD))
         if abs(self.yaw_rad) > math.pi:
             object.__setattr__(self, "yaw_rad", wrap_angle(self.yaw_rad))
-        check_fields(self, position_std_m=(_ABOVE_ZERO, 1e3), yaw_std_rad=(_ABOVE_ZERO, math.pi))
+        check_fields(self, position_std_m=(ABOVE_ZERO, 1e3), yaw_std_rad=(ABOVE_ZERO, math.pi))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import numpy as np
 from worldstate.abduction.co_evidence import Sector as Sector
 from worldstate.abduction.road_users import ClassShares, class_shares
 from worldstate.ground import InvalidArgumentError, finite_array, in_range, integer_ns, named, nanoseconds
-from worldstate.ground.checks import all_of, check_fields, pair
+from worldstate.ground.checks import ABOVE_ZERO, BELOW_ONE, all_of, check_fields, pair
 
 # Limits of accepted values: farther objects have no effect within the horizons of the filter. A covariance
 # with variances outside these limits is singular after rounding or contains no information.
@@ -68,9 +68,7 @@ class Position:
         even = 0.5 * (covariance + covariance.T)
         object.__setattr__(self, "covariance", tuple(tuple(row) for row in even.tolist()))
         object.__setattr__(self, "position_m", pair("position_m", self.position_m, _FARTHEST_M))
-        exists = self.existence_probability
-        exists = in_range("existence_probability", exists, 0.0, 1.0, open_low=True, open_high=True)
-        object.__setattr__(self, "existence_probability", exists)
+        check_fields(self, existence_probability=(ABOVE_ZERO, BELOW_ONE))
         object.__setattr__(self, "classes", class_shares("classes", self.classes))
 
 
@@ -101,17 +99,10 @@ class SearchedSector:
     clutter_rate: float = 0.01
 
     def __post_init__(self) -> None:
-        check_fields(self, sector=Sector)
+        check_fields(self, sector=Sector, range_m=(ABOVE_ZERO, _FARTHEST_M))
+        check_fields(self, detection_probability=(0.0, BELOW_ONE), clutter_rate=(ABOVE_ZERO, BELOW_ONE))
         in_range("centre_rad", self.sector.centre_rad, -np.pi, np.pi)
-        in_range("half_width_rad", self.sector.half_width_rad, 0.0, np.pi, open_low=True)
-        found, clutter = self.detection_probability, self.clutter_rate
-        numbers = {
-            "range_m": in_range("range_m", self.range_m, 0.0, _FARTHEST_M, open_low=True),
-            "detection_probability": in_range("detection_probability", found, 0.0, 1.0, open_high=True),
-            "clutter_rate": in_range("clutter_rate", clutter, 0.0, 1.0, open_low=True, open_high=True),
-        }
-        for name, number in numbers.items():
-            object.__setattr__(self, name, number)
+        in_range("half_width_rad", self.sector.half_width_rad, ABOVE_ZERO, np.pi)
 
 
 @dataclass(frozen=True, slots=True)

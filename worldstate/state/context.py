@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 from worldstate.ground import InvalidArgumentError, in_range
-from worldstate.ground.checks import all_of, check_fields, pair
+from worldstate.ground.checks import ABOVE_ZERO, all_of, check_fields, pair
 from worldstate.ground.serialisation import ADDED, Layout, Probability
 
 _LEAST_STD_RAD, _FASTEST, _FARTHEST_M = 1e-4, 100.0, 1e6  # _FASTEST is in Hz or m/s
 
-_AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (math.ulp(0.0), math.pi)
+_AZIMUTHS_RAD, _STDS_RAD = (-math.pi, math.pi), (ABOVE_ZERO, math.pi)
 _OCCLUDER = {
     "id": str,
     "direction": str,
@@ -19,7 +19,7 @@ _OCCLUDER = {
     "hidden_azimuth_rad": _AZIMUTHS_RAD,
     "hidden_std_rad": _STDS_RAD,
     "edge_std_rad": _STDS_RAD,
-    "pace_hz": (math.ulp(0.0), _FASTEST),
+    "pace_hz": (ABOVE_ZERO, _FASTEST),
     "assumed": bool,
     "hides": bool,
     "crossing_m": (0.0, 2.0 * _FARTHEST_M, None),
