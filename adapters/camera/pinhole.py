@@ -3,14 +3,14 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.adapters.files.file_io import read_record, refused_as_file
 from worldstate.ground import BoolArray, FloatArray, InvalidArgumentError, finite_array, in_range, wrap_angle
-from worldstate.ground.serialisation import ADDED
+from worldstate.ground.serialisation import ADDED, Check, Probability
 from worldstate.measurement.measurement import Sighting
 
 # Largest offset in 64-bit nanoseconds, and largest yaw before wrapping.
@@ -258,41 +258,52 @@ def read_camera(path: str | Path) -> PinholeCamera:
         return read_record(CameraRecord, path, "camera", by_hand=True).camera()
 
 
+def _between(low: float, high: float) -> Check:
+    return Check(f"a number in ({low}, {high})", lambda value: low < value < high)
+
+
+_Tilt = Annotated[float, _between(-90.0, 90.0)]
+_MOST_TURNS_DEG = math.degrees(MOST_TURNS_RAD)
+
+
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
-    """Fields of a camera file, and of each camera in a car file."""
+    """Fields of a camera file, and of each camera in a car file; in units and under names of the file."""
 
     width_px: int
     height_px: int
-    horizontal_fov_deg: float | None = None
-    fx: float | None = None
+    horizontal_fov_deg: Annotated[float, _between(0.0, 180.0)] | None = None
+    fx: Annotated[float, _between(0.0, math.inf)] | None = None
     cx: float | None = None
-    yaw_deg: float | None = None
-    pitch_deg: float | None = None
-    roll_deg: float | None = None
+    yaw_deg: Annotated[float, _between(-_MOST_TURNS_DEG, _MOST_TURNS_DEG)] | None = None  # is wrapped later
+    pitch_deg: _Tilt | None = None
+    roll_deg: _Tilt | None = None
     position_m: tuple[float, float, float] | None = None
     stamp_offset_s: float | None = None
     name: str | None = None
     detections: str | None = None
-    image_rate_hz: float | None = None
+    image_rate_hz: Annotated[float, _between(0.0, 1e4)] | None = None
     miss_rates: str | None = None
     classes: tuple[str, ...] = field(default=("car", "motorcycle"), metadata=ADDED)
-    min_score: float = field(default=0.75, metadata=ADDED)
-    min_box_px: float | None = None
+    min_score: Probability = field(default=0.75, metadata=ADDED)
+    min_box_px: Annotated[float, Check("a number >= 0", lambda value: value >= 0.0)] | None = None
     labels: tuple[str, ...] = field(default=("car",), metadata=ADDED)
 
     def camera(self) -> PinholeCamera:
         """Return the camera."""
         if (self.horizontal_fov_deg is None) == (self.fx is None):
             raise InvalidArgumentError("camera: expected either horizontal_fov_deg or fx")
-        self._check_units()
         half_angle = 0.5 * math.radians(self.horizontal_fov_deg or 0.0)
         if self.fx is not None:
-            fx = in_range("camera.fx", self.fx, 0.0, math.inf, open_low=True)
-            half_angle = math.atan2(0.5 * self.width_px, fx)
+            half_angle = math.atan2(0.5 * self.width_px, self.fx)
+        if self.cx is not None:
+            in_range("camera.cx", self.cx, 0.0, self.width_px)
         if self.position_m is None:
             problem = "expected its position in base_link, metres; [0, 0, 0] if it is at the array"
             raise InvalidArgumentError(f"camera.position_m: {problem}")
+        if math.hypot(*self.position_m[:2]) >= NOMINAL_RANGE_M:
+            expected = f"expected less than {NOMINAL_RANGE_M:g} m from the array along x and y, metres"
+            raise InvalidArgumentError(f"camera.position_m: {expected}, got {list(self.position_m)}")
         return PinholeCamera(
             width_px=self.width_px,
             height_px=self.height_px,
@@ -304,17 +315,3 @@ class CameraRecord:
             roll_rad=math.radians(self.roll_deg or 0.0),
             stamp_offset_s=self.stamp_offset_s or 0.0,
         )
-
-    def _check_units(self) -> None:
-        """Check numbers under the names and in the units of the file."""
-        for name, low in (("horizontal_fov_deg", 0.0), ("pitch_deg", -90.0), ("roll_deg", -90.0)):
-            if (given := getattr(self, name)) is not None:
-                in_range(f"camera.{name}", given, low, low + 180.0, open_low=True, open_high=True)
-        if self.yaw_deg is not None:  # is wrapped later
-            most_deg = math.degrees(MOST_TURNS_RAD)
-            in_range("camera.yaw_deg", self.yaw_deg, -most_deg, most_deg)
-        if self.cx is not None:
-            in_range("camera.cx", self.cx, 0.0, self.width_px)
-        if self.position_m is not None and math.hypot(*self.position_m[:2]) >= NOMINAL_RANGE_M:
-            expected = f"expected less than {NOMINAL_RANGE_M:g} m from the array along x and y, metres"
-            raise InvalidArgumentError(f"camera.position_m: {expected}, got {list(self.position_m)}")

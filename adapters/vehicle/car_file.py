@@ -1,7 +1,6 @@
 """Car files: array, cameras with their detections, odometry and model of a vehicle in one file."""
 
 import logging
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -277,16 +276,12 @@ def _beside(folder: Path, file: str | None) -> Path | None:
 
 def _setup(record: CameraRecord, folder: Path) -> CameraSetup:
     """Return the further settings of a camera, with its files in a folder."""
-    if (rate_hz := record.image_rate_hz) is not None:
-        in_range("camera.image_rate_hz", rate_hz, 0.0, 1e4, open_low=True)
     detections, rates = (_beside(folder, file) for file in (record.detections, record.miss_rates))
-    in_range("camera.min_score", record.min_score, 0.0, 1.0)
     boxes = DetectionFilter(frozenset(record.classes), record.min_score)
     if record.min_box_px is not None:
         # Converted from the camera's images to those of OVAD, to which the filter refers.
-        least_px = in_range("camera.min_box_px", record.min_box_px, 0.0, math.inf)
-        boxes = replace(boxes, min_height_px=least_px * OVAD_HEIGHT_PX / record.height_px)
-    return CameraSetup(detections, rate_hz, rates, boxes, record.labels)
+        boxes = replace(boxes, min_height_px=record.min_box_px * OVAD_HEIGHT_PX / record.height_px)
+    return CameraSetup(detections, record.image_rate_hz, rates, boxes, record.labels)
 
 
 def _relative(record: CameraRecord, array_m: tuple[float, float, float]) -> PinholeCamera:

@@ -187,6 +187,8 @@ def test_a_side_that_two_cameras_share_is_searched_by_both() -> None:
 
 def test_a_detection_of_one_camera_is_present() -> None:
     both = SeveralCameras({"front": camera(0.0), "left": camera(60.0, car=True)})
+    beside = both.ask(NOW, bearing(0.7))
+    assert isinstance(beside, Absent) and beside.clutter_rate == pytest.approx(1.0 - 0.99**2)
     assert isinstance(both.ask(NOW, bearing(1.05)), Present)
     looks = both.looks(NOW)
     assert [(one.look.sensor, len(one.sightings)) for one in looks] == [("front", 0), ("left", 1)]

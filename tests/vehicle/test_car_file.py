@@ -109,7 +109,7 @@ def changed(part: str, **keys: object) -> object:
         (changed("front", fov=60.0), r"car.cameras\[0\]: expected keys among .*, got \['fov'\]"),
         (changed("front", stamp_offset_s=1e10), r"car.cameras\[0\]: stamp_offset_s: .* got 1"),
         (changed("front", position_m=None), r"car.cameras\[0\]: .*position_m: expected its position"),
-        (changed("front", roll_deg=90.0), r"car.cameras\[0\]: camera.roll_deg: expected a number in \(-90"),
+        (changed("front", roll_deg=90.0), r"car.cameras\[0\].roll_deg: expected a number in \(-90"),
     ],
 )
 def test_errors_of_a_car_file_name_the_field(tmp_path, car, said):
