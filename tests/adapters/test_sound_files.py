@@ -84,10 +84,10 @@ def test_blocks_need_a_length_and_an_open_file(long_file: Path) -> None:
 
 def test_a_silent_file_of_one_microphone_is_a_silent_channel(tmp_path: Path) -> None:
     samples = noise(channels=4)
-    samples[:, 2] = 0.0
+    samples[:, 1:3] = 0.0
     files = tuple(write(tmp_path / f"{k}.wav", samples[:, k], encoding="FLOAT") for k in range(4))
     with open_sound(files, 4, strict=False) as source:
-        assert source.silent_channels == (3,)
+        assert source.silent_channels == (2, 3), "half of them are enough"
         np.testing.assert_array_equal(np.concatenate(list(source.blocks())), samples)
     with pytest.raises(SilentChannelsError, match="every channel"):
         open_sound(files, 4)
