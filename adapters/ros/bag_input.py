@@ -27,7 +27,7 @@ from worldstate.ground.typing import Float32Array, FloatArray, IntArray
 from worldstate.measurement.odometry import Odometry
 
 from . import message_types as types
-from .message_types import instant_of, stamp_of, typestore
+from .message_types import instant_of, typestore
 from .sample_clock import begins_again, contradiction, lost_before
 
 # Commands that may repair a file of each storage.
@@ -340,10 +340,9 @@ def _described(bag: BagReader, topic: str, kind: str, message: Any) -> sound_fil
 
 def _packet(pcm: sound_file.RawPcm, message: Any, recorded_ns: int) -> AudioPacket:
     """Return the bytes of a message with the time of their first sample."""
-    if hasattr(message, "timestamp"):
-        stamp_ns = instant_of(message.timestamp)
-    else:
-        stamp_ns = stamp_of(message.header) if hasattr(message, "header") else 0
+    head = getattr(message, "header", message)
+    at = getattr(head, "stamp", getattr(head, "timestamp", None))
+    stamp_ns = 0 if at is None else instant_of(at)
     packet = AudioPacket(stamp_ns, recorded_ns, pcm, _bytes_of(pcm, message))
     # The stamp of AudioFrame is the time of its last sample, and so is the recording time of messages without
     # stamp.
@@ -530,7 +529,9 @@ def _timed(
     If more than three in four stamps repeat an earlier one, for example because a node always sends its start
     time, they are ignored. The time of recording then replaces them, as for messages without a stamp.
     """
-    told = [(stamp_of(one.header), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)]
+    told = [
+        (instant_of(one.header.stamp), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)
+    ]
     stamped = [stamp_ns for stamp_ns, *_ in told if stamp_ns]
     if stands := 4 * len({*stamped}) < len(stamped):  # transports hardly ever repeat a message so often
         _LOG.warning("%s: stamps of %s do not advance, so the times of recording are used", bag.path, topic)

@@ -30,39 +30,38 @@ def stamped(first_s: float, unit: float = 1e9) -> object:
     }
 
 
+def boxes(content: object) -> Mapping[str, object]:
+    return {"--detections d.json": content}
+
+
+def car(**parts: object) -> Mapping[str, object]:
+    return {"--car car.json": parts}
+
+
+CAMERAS = (
+    {**FRONT, "detections": "asked.json"},
+    {**FRONT, "name": "rear", "yaw_deg": 180, "detections": "nothing.json"},
+)
 # Inputs beside the sound: an option with the content of its file or its words, and the printed line.
 SILENT: dict[str, tuple[Mapping[str, object], str]] = {
-    "boxes of no image": ({"--detections d.json": NOTHING}, "searched no image"),
-    "results of no box": ({"--detections d.json": []}, "searched no image"),
-    "a list of no image": ({"--detections d.json": {"images": [], "annotations": []}}, "searched no image"),
-    "one image listed": (
-        {"--detections d.json": {"images": [{"id": 0}], "annotations": []}},
-        "1 of 1 stamps",
-    ),
+    "boxes of no image": (boxes(NOTHING), "searched no image"),
+    "results of no box": (boxes([]), "searched no image"),
+    "a list of no image": (boxes({"images": [], "annotations": []}), "searched no image"),
+    "one image listed": (boxes({"images": [{"id": 0}], "annotations": []}), "1 of 1 stamps"),
     "MOTChallenge text, empty": ({"--detections d.txt": ""}, "searched no image"),
     "boxes that do not count": (
-        {"--detections d.json": {"detections_per_frame": [TRUCK] + [EMPTY] * 29}},
+        boxes({"detections_per_frame": [TRUCK] + [EMPTY] * 29}),
         "none of its boxes has counted yet",
     ),
-    "boxes of another day": ({"--detections d.json": stamped(86_400.0)}, "stamp_offset_s"),
-    "boxes in milliseconds": ({"--detections d.json": stamped(0.0, 1e3)}, "in another unit"),
-    "boxes of an hour before": ({"--detections d.json": [{**BOX, "image_id": 36_000}]}, "image_rate_hz"),
-    "boxes of the last hop": ({"--detections d.json": stamped(2.9)}, "of 30 stamps lie within the sound"),
+    "boxes of another day": (boxes(stamped(86_400.0)), "stamp_offset_s"),
+    "boxes in milliseconds": (boxes(stamped(0.0, 1e3)), "in another unit"),
+    "boxes of an hour before": (boxes([{**BOX, "image_id": 36_000}]), "image_rate_hz"),
+    "boxes of the last hop": (boxes(stamped(2.9)), "of 30 stamps lie within the sound"),
     "a camera alone": ({"--camera c.json": LENS}, "--camera without --detections"),
-    "a camera of a car alone": ({"--car car.json": {"cameras": [FRONT]}}, "cameras of --car without"),
-    "an empty car": ({"--car car.json": {}}, "no array, camera, model, odometry or measurements"),
-    "a car's name": ({"--car car.json": {"name": "mine"}}, "no array, camera"),
-    "one of two cameras": (
-        {
-            "--car car.json": {
-                "cameras": [
-                    {**FRONT, "detections": "asked.json"},
-                    {**FRONT, "name": "rear", "yaw_deg": 180, "detections": "nothing.json"},
-                ]
-            }
-        },
-        "rear: the detector searched no image",
-    ),
+    "a camera of a car alone": (car(cameras=[FRONT]), "cameras of --car without"),
+    "an empty car": (car(), "no array, camera, model, odometry or measurements"),
+    "a car's name": (car(name="mine"), "no array, camera"),
+    "one of two cameras": (car(cameras=CAMERAS), "rear: the detector searched no image"),
     "an empty context": ({"--context x.json": {}}, "it is empty"),
     "odometry, empty": ({"--odometry o.csv": odometry()}, "at least one line"),
     "odometry of another day": (

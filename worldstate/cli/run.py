@@ -43,19 +43,9 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     check_extra(*exports.needed_extras(arguments))
     from worldstate.operations.viewing.state_figure import drawn_run
 
-    source = adapters.open_source(
-        arguments.input,
-        arguments.array,
-        car=arguments.car,
-        camera=arguments.camera,
-        detections=inputs.reported(arguments),
-        detector=arguments.detector,
-        odometry=arguments.odometry,
-        topics=inputs.named("--topic", arguments.topic),
-        resume=arguments.resume,
-        start_s=arguments.start or 0.0,
-        **inputs.listen_parts(arguments),
-    )
+    asked = {name: vars(arguments)[name] for name in ("detector", "odometry", "resume")}
+    asked |= inputs.listen_parts(arguments) | {"start_s": arguments.start or 0.0}
+    source = inputs.recorded(arguments, arguments.input, **asked)
     with (
         drawn_run(arguments.figure, source, str(source.audio_path)) as draw,
         exports.exported_hops(arguments, source) as export,

@@ -40,11 +40,11 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     command.check_beside(arguments, out="car")
     recordings = [found for path in arguments.input for found in find_inputs(path)]
     inputs.check_boxes(arguments, len(recordings))
-    settings = inputs.search_of(arguments)
+    bare = {"settings": inputs.search_of(arguments), "uncalibrated": True}
     passes = [
         one
         for path in progress.track(recordings, "listening", len(recordings))
-        for one in heard_passes(inputs.recorded(arguments, path, settings), LARGEST_OFFSET_S)
+        for one in heard_passes(inputs.recorded(arguments, path, **bare), LARGEST_OFFSET_S)
     ]
     found = align(passes)
     if arguments.out is not None:

@@ -13,7 +13,6 @@ from worldstate.ground.errors import InputFileError, InvalidArgumentError
 if TYPE_CHECKING:
     from worldstate.abduction.sequence.street_sides import SidePatterns
     from worldstate.adapters.audio.sound_file import Audio, SoundInput
-    from worldstate.adapters.source import Source
     from worldstate.state import Context
 
 _EXAMPLE = "  arecord -D hw:1 -t raw -f S32_LE -r 48000 -c 8 | {} pcm:48000:8:s32"
@@ -257,11 +256,9 @@ def check_boxes(arguments: argparse.Namespace, recordings: int) -> None:
 
 
 def recorded(
-    arguments: argparse.Namespace,
-    path: "SoundInput | list[Path]",
-    settings: "adapters.ListenSettings | None" = None,
-) -> "Source":
-    """Return a recording with its sound and the boxes of its camera, for any array."""
+    arguments: argparse.Namespace, path: "SoundInput | list[Path]", **more: Any
+) -> "adapters.Source":
+    """Return a recording with its sound and the boxes of its camera; `more` is passed to `open_source`."""
     return adapters.open_source(
         path,
         arguments.array,
@@ -269,14 +266,13 @@ def recorded(
         camera=arguments.camera,
         detections=reported(arguments),
         topics=named("--topic", getattr(arguments, "topic", [])),
-        settings=settings,
-        uncalibrated=True,
+        **more,
     )
 
 
 def camera_source(
     arguments: argparse.Namespace, path: "SoundInput | list[Path]"
-) -> "tuple[Source, adapters.DetectionLog]":
+) -> "tuple[adapters.Source, adapters.DetectionLog]":
     """Return a recording, with any array, and the boxes of its camera.
 
     Raises
@@ -284,7 +280,7 @@ def camera_source(
     InputFileError
         If there are no boxes of a camera.
     """
-    source = recorded(arguments, path)
+    source = recorded(arguments, path, uncalibrated=True)
     if source.detections is None:
         raise InputFileError(source.audio_path, "expected boxes of a camera beside it, or --detections")
     return source, source.detections

@@ -12,7 +12,7 @@ Examples
 """
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,15 +39,15 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
 
     arguments.out = check_page(arguments.out or arguments.log.with_suffix(".html"))
     output.check_outputs(arguments, "out")
-    with progress.progress_bar(f"reading {arguments.log.name}", None) as bar:
-        states = _between(arguments.log, arguments.between or (-9e9, 9e9), bar.advance)
-        page = page_data(states, title=arguments.log.name, media=read_media(arguments.log))
+    chosen = _between(arguments.log, arguments.between or (-9e9, 9e9))
+    states = progress.track(chosen, f"reading {arguments.log.name}")
+    page = page_data(states, title=arguments.log.name, media=read_media(arguments.log))
     write_log_page(arguments.out, page)
     report = {"states": len(page["states"]), "remarks": page["remarks"], "written": str(arguments.out)}
     return output.CommandResult(report)
 
 
-def _between(log: Path, span_s: Sequence[float], advance: Callable[[], None]) -> "Iterator[WorldState]":
+def _between(log: Path, span_s: Sequence[float]) -> "Iterator[WorldState]":
     """Yield the snapshots within a span; refuse a span without any."""
     from worldstate.adapters.state_log import read_log
 
@@ -58,7 +58,6 @@ def _between(log: Path, span_s: Sequence[float], advance: Callable[[], None]) ->
         if first_ns <= state.stamp_ns <= last_ns:
             yield state
             empty = False
-        advance()
     if empty:
         its = " to ".join(f"{ground.seconds(stamp_ns):.1f}" for stamp_ns in stamps_ns)
         given = " to ".join(f"{at_s:g}" for at_s in span_s)

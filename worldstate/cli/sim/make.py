@@ -132,7 +132,9 @@ def _run_stream(arguments: argparse.Namespace) -> output.CommandResult:
         "hazards": sum(one.hazard for one in stream.vehicles),
         "site": settings.site.name,
         "sample_rate_hz": settings.sample_rate_hz,
-        **{"traffic": arguments.traffic or "calm", "preset": arguments.preset, "seed": settings.seed},
+        "traffic": settings.traffic.name,
+        "preset": arguments.preset,
+        "seed": settings.seed,
     }
     return output.CommandResult(summary, lines=["", f"see {stream.folder / FIGURE_NAME}"])
 
