@@ -79,7 +79,7 @@ def former_mcap(name: str, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_former_log_is_read_as_its_upgrade_and_loses_nothing(name: str, tmp_path: Path) -> None:
+def test_a_former_log_is_read_as_its_upgrade_and_loses_nothing(name, tmp_path):
     log, upgraded = former_log(name, tmp_path), tmp_path / "upgraded.jsonl"
     assert main(["log", "upgrade", str(log), str(upgraded)]) == 0
     assert list(read_log(log)) == list(read_log(upgraded))
@@ -107,7 +107,7 @@ def test_a_former_log_is_read_as_its_upgrade_and_loses_nothing(name: str, tmp_pa
             assert after == before
 
 
-def test_a_former_mcap_file_keeps_its_images_and_sound_and_is_drawn_anew(tmp_path: Path) -> None:
+def test_a_former_mcap_file_keeps_its_images_and_sound_and_is_drawn_anew(tmp_path):
     log, upgraded = former_mcap("watched", tmp_path), tmp_path / "upgraded.mcap"
     assert main(["log", "upgrade", str(log), str(upgraded)]) == 0
     assert list(read_log(log)) == list(read_log(upgraded))
@@ -122,17 +122,13 @@ def test_a_former_mcap_file_keeps_its_images_and_sound_and_is_drawn_anew(tmp_pat
 
 
 @pytest.mark.parametrize(("given", "named"), [("watched.mcap", "x.jsonl"), ("watched.jsonl", "x.mcap")])
-def test_an_upgrade_that_would_lose_images_or_lie_of_its_form_is_refused(
-    given: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_upgrade_that_would_lose_images_or_lie_of_its_form_is_refused(given, named, tmp_path, capsys):
     former_mcap("watched", tmp_path)
     assert main(["log", "upgrade", str(tmp_path / given), str(tmp_path / named)]) == 2
     assert named in capsys.readouterr().err and not (tmp_path / named).exists()
 
 
-def test_every_consumer_of_an_advisory_is_given_that_it_is_not_usable(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_consumer_of_an_advisory_is_given_that_it_is_not_usable(tmp_path, capsys):
     """The same states of an uncalibrated rule, and of one with a budget."""
     shown = []
     parts = runpy.run_path(str(EXAMPLES / "own_parts" / "own_parts.py"))
@@ -176,9 +172,7 @@ def without_model(state: WorldState) -> WorldState:
     return replace(state, cues=cues, entities=tuple(heard), relations=(), calibrated=False)
 
 
-def test_what_has_no_side_class_or_risk_is_left_out_and_not_taken_for_zero(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_has_no_side_class_or_risk_is_left_out_and_not_taken_for_zero(tmp_path, capsys):
     states, log = [without_model(one) for one in scripted_states()], tmp_path / "states.jsonl"
     log.write_text("".join(f"{one.to_json()}\n" for one in states))
     assert [state for _, state in read_log(log)] == states and {one.risk for one in states} == {None}

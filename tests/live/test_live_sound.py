@@ -50,14 +50,6 @@ def played(source, **options):
     return replace(source, sound=LiveSound(Playback(open_sound(source.sound), **options)))
 
 
-def test_the_oldest_item_is_dropped_and_counted():
-    channel = BoundedChannel[int](3)
-    for number in range(10):
-        channel.put(number)
-    assert [channel.take() for _ in range(3)] == [7, 8, 9]
-    assert channel.dropped == 7
-
-
 def test_queued_items_precede_end_and_error_and_later_ones_are_ignored():
     channel = BoundedChannel[int](3)
     channel.put(1)

@@ -61,7 +61,7 @@ lengths = st.sampled_from([2 * MS, 10 * MS, 21_333_333, 100 * MS])
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=st.integers(0, 10_000), length_ns=lengths, drift=st.floats(-2e-4, 2e-4))
 @settings(max_examples=30, deadline=None)
-def test_late_stamps_are_no_losses(kind: str, seed: int, length_ns: int, drift: float) -> None:
+def test_late_stamps_are_no_losses(kind, seed, length_ns, drift):
     stamps = late(kind, 400, length_ns, np.random.default_rng(seed))
     stamps += np.round(np.arange(400) * length_ns * drift).astype(np.int64)
     spans = np.full(400, float(length_ns))
@@ -77,7 +77,7 @@ def test_late_stamps_are_no_losses(kind: str, seed: int, length_ns: int, drift: 
     jitter=st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
-def test_permanent_delays_are_losses(places: list[int], length_ns: int, jitter: bool) -> None:
+def test_permanent_delays_are_losses(places, length_ns, jitter):
     """The oracle is the removed messages; without jitter each loss precedes the next message."""
     after = 400 + 500 * MS // length_ns
     kept = np.setdiff1d(np.arange(after), places)
@@ -92,7 +92,7 @@ def test_permanent_delays_are_losses(places: list[int], length_ns: int, jitter: 
 
 
 @pytest.mark.parametrize("first_late_s", [0.0, 0.3, 2.5])
-def test_the_first_sample_is_not_later_than_later_messages_allow(first_late_s: float) -> None:
+def test_the_first_sample_is_not_later_than_later_messages_allow(first_late_s):
     stamps, spans = even(400)
     stamps[0] += round(first_late_s * SECOND)
     stamps[1:20] = np.maximum(stamps[1:20], stamps[0] + np.arange(1, 20))
@@ -103,7 +103,7 @@ def test_the_first_sample_is_not_later_than_later_messages_allow(first_late_s: f
 
 @given(passes=st.integers(2, 4), count=st.integers(260, 500))
 @settings(max_examples=20, deadline=None)
-def test_a_repeated_bag_continues_the_count(passes: int, count: int) -> None:
+def test_a_repeated_bag_continues_the_count(passes, count):
     stamps, spans = np.tile(even(count)[0], passes), even(count * passes)[1]
     found = begins_again(stamps, spans)
     assert found == [(k * count, k * count * 10 * MS) for k in range(1, passes)]
@@ -139,7 +139,7 @@ def heard(path: Path, stated: RawPcm | None = None) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "zero", "a loop"])
-def test_every_sample_of_a_bag_is_read(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_every_sample_of_a_bag_is_read(kind, tmp_path, caplog):
     stamps = late(kind, 600, 10 * MS, np.random.default_rng(3))
     if kind == "zero":
         stamps[:] = -1
@@ -152,16 +152,14 @@ def test_every_sample_of_a_bag_is_read(kind: str, tmp_path: Path, caplog: pytest
 
 
 @pytest.mark.parametrize("step", [101, 1001, 1277, 4099])
-def test_samples_may_be_split_between_messages(
-    step: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_samples_may_be_split_between_messages(step, tmp_path, caplog):
     path = bag_of(tmp_path / "whole", spoken(begins(step), step=step))
     np.testing.assert_array_equal(heard(path), SOUND)
     assert not caplog.text
 
 
 @pytest.mark.parametrize("step", [1001, 1277])
-def test_a_lost_message_does_not_shift_channels(step: int, tmp_path: Path) -> None:
+def test_a_lost_message_does_not_shift_channels(step, tmp_path):
     """Messages may split samples; later samples keep their channels."""
     messages = [*spoken(begins(step), step=step)]
     del messages[41:44]
@@ -171,7 +169,7 @@ def test_a_lost_message_does_not_shift_channels(step: int, tmp_path: Path) -> No
     assert same[: 40 * step // 8 - 1].all() and same[43 * step // 8 + 1 :].all()
 
 
-def test_a_repeated_bag_shifts_boxes_and_odometry(tmp_path: Path) -> None:
+def test_a_repeated_bag_shifts_boxes_and_odometry(tmp_path):
     stamps, recorded, seen = np.tile(even(300)[0], 2), even(600)[0] + 3 * MS, range(5, 600, 10)
     images = [image(int(stamps[k]), int(recorded[k]) + 1) for k in seen]
     driven = [moved(int(stamps[k]), int(recorded[k]) + 1, 0.1 * k) for k in seen]
@@ -196,9 +194,7 @@ STAMPED = {
 
 
 @pytest.mark.parametrize("name", STAMPED)
-def test_bad_stamps_lose_no_boxes_or_odometry(
-    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_bad_stamps_lose_no_boxes_or_odometry(name, tmp_path, caplog):
     messages = list[Message]()
     for k in range(40):
         recorded_ns, tenth = 3 * SECOND + k * TENTH_NS, STAMPED[name](k)
@@ -229,15 +225,13 @@ def test_bad_stamps_lose_no_boxes_or_odometry(
         ({}, 2, "stamps advance by 3.0 s while 6.0 s of samples were sent"),  # mixed passes
     ],
 )
-def test_stamps_that_contradict_the_rate_raise_an_error(
-    info: dict[str, int], stretch: int, said: str, tmp_path: Path
-) -> None:
+def test_stamps_that_contradict_the_rate_raise_an_error(info, stretch, said, tmp_path):
     path = bag_of(tmp_path / "bag", spoken(T0 + np.arange(600) // stretch * 10 * MS, **info))
     with pytest.raises(InputFileError, match=re.escape(said) + ".*--topic"):
         read_sound(path)
 
 
-def test_the_audio_format_can_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_audio_format_can_be_given(tmp_path, capsys):
     bare = bag_of(tmp_path / "bare", [*spoken(even(600)[0])][1:])
     wrong = bag_of(tmp_path / "wrong", spoken(even(600)[0], sample_rate=24_000))
     array = tmp_path / "ring.csv"
@@ -258,9 +252,7 @@ def test_the_audio_format_can_be_given(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize(("storage", "way"), [("mcap", "`mcap recover"), ("sqlite3", "`sqlite3 IN .recover")])
-def test_incomplete_bags_are_read_or_name_the_command_that_mends_them(
-    storage: str, way: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_incomplete_bags_are_read_or_name_the_command_that_mends_them(storage, way, tmp_path, caplog):
     path = bag_of(tmp_path / "bag", spoken(even(600)[0]), storage)
     (path / "metadata.yaml").unlink()
     assert is_bag(path)
@@ -275,7 +267,7 @@ def test_incomplete_bags_are_read_or_name_the_command_that_mends_them(
     assert not is_bag(path), "a recording with a log beside it"
 
 
-def test_24_bit_samples_in_four_bytes_are_detected(tmp_path: Path) -> None:
+def test_24_bit_samples_in_four_bytes_are_detected(tmp_path):
     wide = np.random.default_rng(2).normal(0.0, 1e5, (16_000, 4)).astype("<i4")
     stamps, each = T0 + np.arange(20) * TENTH_NS, {"step": 12_800, "data": wide.tobytes()}
     right = bag_of(tmp_path / "right", spoken(stamps, **each, sample_format="S24_32LE"))
