@@ -1,7 +1,8 @@
-"""Hop tables without information, to be filled in by a test."""
+"""Hop tables without information, and streams of given vehicles, to be filled in by a test."""
 
 import numpy as np
 
+from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.operations.recordings.hop_table import HopTable
 
 
@@ -20,3 +21,15 @@ def blank_stream(name, hops):
         },
         name=name,
     )
+
+
+VEHICLE = [("vehicle", int), *((name, "U16") for name in ("flow", "kind", "arm"))]
+VEHICLE += [("entry_s", float), ("hazard", bool)]
+ROW = [(name, float) for name in ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")]
+
+
+def heard_stream(vehicles, rows, hops, **about):
+    """Return a processed stream from rows as in `VEHICLE` and `ROW`, and from columns of its hops."""
+    made = np.array(vehicles, VEHICLE), np.array(rows, ROW)
+    told, seen = (HopTable({name: one[name] for name in one.dtype.names}) for one in made)
+    return HeardStream(HopTable(hops, about=about), told, seen.replace(in_view=seen.in_view > 0.0))

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hop_tables import heard_stream
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,7 +18,6 @@ from worldstate.commissioning.heard_stream import (
 )
 from worldstate.commissioning.stream_exam import in_view_bearings
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation import site
 from worldstate.simulation.stream.settings import StreamSettings
 
@@ -79,9 +79,8 @@ def passing(bearing_deg: float) -> HeardStream:
     time_s = np.round(np.arange(1.0, 3.0, 0.1), 1)
     places = ((1, 5.0, 5.0, 70.0), (2, 0.0, -9.0, 60.0))
     rows = [(number, t, x, y, t < 2.0, level) for number, x, y, level in places for t in time_s]
-    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
-    hops = HopTable({"time_s": time_s, "bearing_rad": np.full(len(time_s), np.radians(bearing_deg))})
-    return HeardStream(hops, HopTable({}), HopTable.of_rows(names, rows))
+    hops = {"time_s": time_s, "bearing_rad": np.full(len(time_s), np.radians(bearing_deg))}
+    return heard_stream([], rows, hops)
 
 
 def test_bearings_are_compared_with_the_loudest_vehicle_in_view() -> None:

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hop_tables import heard_stream
 from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.ensemble import HistGradientBoostingClassifier
@@ -11,7 +12,6 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from worldstate.abduction.sequence.sequence_inputs import sequence_inputs
 from worldstate.abduction.sequence.sequence_model import GROUPS, LONGEST_S, SequenceModel
 from worldstate.commissioning import commission
-from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import (
     MOVING,
     STANDING,
@@ -25,7 +25,6 @@ from worldstate.commissioning.sequence_training import (
 )
 from worldstate.commissioning.stream_exam import smoothed_log_odds
 from worldstate.ground.typing import FloatArray
-from worldstate.operations.recordings.hop_table import HopTable
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -66,17 +65,9 @@ def test_distant_vehicles_are_weighted_by_level_over_background(background_db: f
     """Fainter vehicles are audible in a quiet street and must not be labelled empty."""
     hops = 12
     rising_db = 48.0 + background_db + np.linspace(-6.0, 6.0, hops)
-    columns = {"time_s": 0.1 * np.arange(hops)}
-    vehicles = {
-        **{"vehicle": np.array([7]), "flow": np.array(["far"]), "kind": np.array(["light"])},
-        **{"arm": np.array(["left"]), "entry_s": np.array([np.nan]), "hazard": np.array([False])},
-    }
-    rows = {
-        **{"vehicle": np.full(hops, 7), "time_s": columns["time_s"], "in_view": np.zeros(hops, bool)},
-        **{"x_m": np.full(hops, 9.0), "y_m": np.full(hops, 60.0), "loudness_db": rising_db},
-    }
-    about = {"site": "SA1", "background_db": background_db}
-    heard = HeardStream(HopTable(columns, about=about), HopTable(vehicles), HopTable(rows))
+    far, time_s = (7, "far", "light", "left", np.nan, False), 0.1 * np.arange(hops)
+    rows = [(7, at_s, 9.0, 60.0, False, level) for at_s, level in zip(time_s, rising_db, strict=True)]
+    heard = heard_stream([far], rows, {"time_s": time_s}, site="SA1", background_db=background_db)
     left, _ = stream_truth(heard).groups().T
     assert [GROUPS[group] for group in left] == ["none"] * 6 + ["rising"] * 6
 

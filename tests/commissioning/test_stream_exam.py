@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import watched_street as street
+from hop_tables import heard_stream
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from mapie.risk_control.methods import find_best_predict_param, get_r_hat_plus
@@ -48,7 +49,6 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.metrics.approach_table import ApproachTable, StreamApproach, hop_outcome
-from worldstate.operations.recordings.hop_table import HopTable
 
 Vehicle = tuple[str, str, str, float]  # flow, kind, arm, T0
 FREE = GROUPS.index("none")
@@ -63,20 +63,9 @@ def heard(vehicles: list[Vehicle], duration_s: float = 60.0, site: str = "SB1") 
             side = 1.0 if arm == "left" else -1.0
             seen = bool(entry_s < time_s < entry_s + 1.5)
             rows.append((number, time_s, 6.0, side * (entry_s - time_s), seen, 60.0))
-    flow, kind, arm, entry_s = zip(*vehicles, strict=True) if vehicles else ((), (), (), ())
-    told = {
-        "vehicle": np.arange(len(vehicles)),
-        "flow": np.array(flow, np.str_),
-        "kind": np.array(kind, np.str_),
-        "arm": np.array(arm, np.str_),
-        "entry_s": np.array(entry_s, np.float64),
-        "hazard": np.ones(len(vehicles), bool),
-    }
-    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
-    columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * len(names)
-    hop_s = np.round(np.arange(1.0, duration_s, 0.1), 1)
-    hops = HopTable({"time_s": hop_s, "bearing_rad": np.zeros(len(hop_s))}, about={"site": site})
-    return HeardStream(hops, HopTable(told), HopTable(dict(zip(names, columns, strict=True))))
+    told, hop_s = enumerate(vehicles), np.round(np.arange(1.0, duration_s, 0.1), 1)
+    hops = {"time_s": hop_s, "bearing_rad": np.zeros(len(hop_s))}
+    return heard_stream([(number, *one, True) for number, one in told], rows, hops, site=site)
 
 
 def examined(stream: HeardStream, spans: list[tuple[float, float, int]]) -> ExaminedStream:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from hop_tables import heard_stream
 
 from worldstate.abduction.signature.ensemble import SMALLEST_LEVEL
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
@@ -10,7 +11,6 @@ from worldstate.abduction.signature.window_classes import WINDOW_CLASSES, side_r
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
-from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.simulated_windows import (
     WEIGHT,
     OpenSource,
@@ -22,7 +22,6 @@ from worldstate.commissioning.simulated_windows import (
     stream_windows,
 )
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.operations.recordings.hop_table import HopTable
 
 TIME_S = np.round(np.arange(1.0, 60.0, 0.1), 1)
 
@@ -30,13 +29,10 @@ TIME_S = np.round(np.arange(1.0, 60.0, 0.1), 1)
 def stream(*vehicles, site="SA1", rng=None):
     """Return vehicles by kind, arm and entry, each in view for three seconds."""
     features = np.ones((len(TIME_S), 60)) if rng is None else rng.uniform(0.05, 0.9, (len(TIME_S), 60))
-    hops = HopTable({"time_s": TIME_S, "feature": features}, about={"site": site})
-    names = ("vehicle", "flow", "kind", "arm", "entry_s", "hazard")
     told = [(i, arm, kind, arm, entry, True) for i, (kind, arm, entry) in enumerate(vehicles)]
     entries = enumerate(entry for _, _, entry in vehicles)
-    rows = [(i, t, 8.0, 1.0, entry <= t <= entry + 3.0) for i, entry in entries for t in TIME_S]
-    seen = HopTable.of_rows(("vehicle", "time_s", "x_m", "y_m", "in_view"), rows)
-    return HeardStream(hops, HopTable.of_rows(names, told), seen)
+    rows = [(i, t, 8.0, 1.0, entry <= t <= entry + 3.0, 0.0) for i, entry in entries for t in TIME_S]
+    return heard_stream(told, rows, {"time_s": TIME_S, "feature": features}, site=site)
 
 
 def label_at(labels, time_s):
