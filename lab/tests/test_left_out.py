@@ -15,7 +15,7 @@ from worldstate_lab.cli.main import main
 
 from worldstate.abduction.sequence.sequence_model import GROUPS, HELD_HOPS, HORIZONS_S, SequencePosterior
 from worldstate.commissioning import commission
-from worldstate.commissioning.commission import fit_of, own_windows, windows_to_learn
+from worldstate.commissioning.commission import own_windows, windows_to_learn
 from worldstate.commissioning.heard_stream import CommissionSettings, HeardStream, learned_streams
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.commissioning.stream_exam import ExaminedStream, smoothed_log_odds
@@ -72,7 +72,7 @@ def quick(monkeypatch):
 def test_training_does_not_depend_on_the_left_out_streams(quick, renderer="rays"):
     every, others = streets(1), streets(2)
     own, rng = own_windows(ovad_array(), FEW, None), np.random.default_rng(FEW.seed)
-    fit = fit_of(windows_to_learn(ovad_array(), FEW, *own, rng))
+    _, fit = windows_to_learn(ovad_array(), FEW, *own, rng)
 
     def learned(changed):
         mixed = [other if changed(one) else one for one, other in zip(every, others, strict=True)]

@@ -271,8 +271,7 @@ def commission(
     def learned(stage: str) -> None:
         on_step(stage, learning_minutes(settings) / LEARNING_STEPS)
 
-    windows_of = windows_to_learn(array, settings, domain, real, rng, jobs)
-    fit = fit_of(windows_of)
+    windows_of, fit = windows_to_learn(array, settings, domain, real, rng, jobs)
     sequence = learn_sequence(streams, fit, settings.onsets_per_hour, rng, jobs, learned)
     learned("window model")
     windows, simulated = windows_of(streams)
@@ -394,18 +393,17 @@ def windows_to_learn(
     real: FeatureTable | None,
     rng: np.random.Generator,
     jobs: int = 1,
-) -> WindowsOf:
-    """Return a function from streams to their training windows, with sources in the open added."""
+) -> tuple[WindowsOf, FitWindows]:
+    """Return functions from streams to their training windows and to a window model trained on them.
+
+    The training windows include sources in the open.
+    """
     number = N_OPEN // 10 if settings.quick else N_OPEN
     open_field = open_field_windows(open_field_features(array, number, rng, jobs, settings.moving_ego))
-    return partial(table_and_beside, real, open_field, domain)
-
-
-def fit_of(windows_of: WindowsOf) -> FitWindows:
-    """Return a function from streams to a window model that is trained on them."""
+    windows_of = partial(table_and_beside, real, open_field, domain)
     # With real windows alone, the model is the same for all streams
     fitted = lru_cache(maxsize=1)(window_model)
-    return lambda some: fitted(*windows_of(some))
+    return windows_of, lambda some: fitted(*windows_of(some))
 
 
 def windows_of_array(table: FeatureTable, settings: CommissionSettings, domain: ModelDomain) -> FeatureTable:

@@ -163,11 +163,8 @@ def _by_kind(told: Sequence[ApproachOutcome]) -> Figures:
 
 def _worst(streams: Sequence[ExaminedStream]) -> Figures:
     """Return the detected share at the worst junction, and the largest number of onsets at any junction."""
-    sites = np.array([one.heard.site for one in streams])
-    there = [
-        _table([streams[i] for i in np.flatnonzero(sites == site).tolist()]).loud().figures()
-        for site in np.unique(sites)
-    ]
+    sites = {one.heard.site for one in streams}
+    there = [_table([one for one in streams if one.heard.site == site]).loud().figures() for site in sites]
     shares, rates = ([one[name] for one in there] for name in ("detected", "onsets_per_hour"))
     return {
         "detected_worst_junction": min((one for one in shares if one is not None), default=None),
@@ -423,7 +420,6 @@ BEFORE_S = np.linspace(0.0, 5.0, 26)
 
 def write_exam_figure(streams: Sequence[ExaminedStream], path: Path) -> None:
     """Draw the share of approaches in alarm and the AUROC against the time before T0, for every site."""
-    sites = sorted({one.heard.site for one in streams})
     with figure_file(path, 9.0, 3.6) as figure:
         warned, ranked = figure.subplots(1, 2)
 
@@ -431,7 +427,7 @@ def write_exam_figure(streams: Sequence[ExaminedStream], path: Path) -> None:
             warned.plot(-BEFORE_S, warned_before(some, BEFORE_S), **style)
             ranked.plot(-BEFORE_S, auroc_before(some, BEFORE_S), **style)
 
-        for site in sites:
+        for site in sorted({one.heard.site for one in streams}):
             here = [one for one in streams if one.heard.site == site]
             onsets = examine(here)["onsets_per_hour"]
             told = site if onsets is None else f"{site}, {onsets:.0f} per hour"

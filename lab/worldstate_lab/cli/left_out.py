@@ -41,7 +41,6 @@ from worldstate.commissioning.alarm_curve import (
 from worldstate.commissioning.commission import (
     FOLDS,
     FitWindows,
-    fit_of,
     heard_streams,
     learn_sequence,
     own_windows,
@@ -105,7 +104,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if not any(one.traffic.hazard_free and not one.traffic.name.startswith(MISLEADING) for one in plan):
         raise InvalidArgumentError("--junctions: expected 3 or more to set the threshold")
     rng, own = np.random.default_rng(settings.seed), own_windows(array, settings, None)
-    fit = fit_of(windows_to_learn(array, settings, *own, rng, arguments.jobs))
+    _, fit = windows_to_learn(array, settings, *own, rng, arguments.jobs)
     with progress_bar("listening", sum(one.minutes for one in plan)) as bar:
         heard = heard_streams(plan, array, arguments.streams, arguments.jobs)
         for planned, one in zip(plan, heard, strict=True):
