@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".svg", ".pdf")
+ANIMATION, PAGE = ((".gif",), "an animation's name"), ((".html", ".htm"), "a page's name")
 # Hops farther apart than this are not joined by a line, because one may be missing.
 HOP_S = 0.1
 GAP_S = 2.5 * HOP_S
@@ -47,17 +48,16 @@ _STYLE = {
 }
 
 
-def check_suffix(path: Path) -> Path:
-    """Return `path` if a figure can be written under this name; commands check it before their work.
+def check_suffix(path: Path, suffixes: Sequence[str] = SUFFIXES, what: str = "a figure name") -> Path:
+    """Return `path` if its name ends in one of `suffixes`; commands check it before their work.
 
     Examples
     --------
     >>> check_suffix(Path("timeline.svg")).name
     'timeline.svg'
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputFileError(path, f"expected a figure name ending in {', '.join(SUFFIXES)}")
-    check_extra("matplotlib")
+    if path.suffix.lower() not in suffixes:
+        raise InputFileError(path, f"expected {what} ending in {', '.join(suffixes)}")
     return path
 
 

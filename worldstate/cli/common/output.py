@@ -10,6 +10,7 @@ from pathlib import Path
 
 from worldstate import adapters
 from worldstate.ground.errors import InputFileError
+from worldstate.ground.extras import check_extra
 
 from .exports import exported_files
 
@@ -125,6 +126,7 @@ def check_outputs(arguments: argparse.Namespace, *options: str, figures: tuple[s
     for name, path in outputs.items():
         if name in figures:
             check_suffix(path)
+            check_extra("matplotlib")
         target = check_target(path)
         if any(_is_read(target, source) for source in inputs):
             raise InputFileError(path, "expected another file to write, because this one is an input")

@@ -37,6 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
     from worldstate.adapters.state_log import read_log
+    from worldstate.operations import figure_style
     from worldstate.operations.viewing import state_figure
 
     asked = arguments.out, arguments.birds_eye, arguments.animate
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     output.check_outputs(arguments, "animate", figures=("out", "birds_eye"))
     command.check_beside(arguments, recording="out", time="birds_eye")
     if arguments.animate is not None:
-        state_figure.check_gif(arguments.animate)
+        figure_style.check_suffix(arguments.animate, *figure_style.ANIMATION)
     states, title = [state for _, state in read_log(arguments.log)], arguments.log.name
     shown = max(states, key=lambda state: state.risk or 0.0)
     if arguments.time is not None:

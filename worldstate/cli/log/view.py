@@ -35,9 +35,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
     from worldstate.adapters.state_log import read_media
-    from worldstate.operations.viewing.log_page import check_page, page_data, write_log_page
+    from worldstate.operations.figure_style import PAGE, check_suffix
+    from worldstate.operations.viewing.log_page import page_data, write_log_page
 
-    arguments.out = check_page(arguments.out or arguments.log.with_suffix(".html"))
+    arguments.out = check_suffix(arguments.out or arguments.log.with_suffix(".html"), *PAGE)
     output.check_outputs(arguments, "out")
     chosen = _between(arguments.log, arguments.between or (-9e9, 9e9))
     states = progress.track(chosen, f"reading {arguments.log.name}")

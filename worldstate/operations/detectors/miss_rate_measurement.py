@@ -1,7 +1,7 @@
 """Miss rates of a camera's detector, measured on degraded frames with reference boxes, and their figure."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,7 @@ _BINS_DEG = (10.0, 20.0, 30.0)
 MIN_OVERLAP = 0.3
 # Half the width of a query sector for clutter, and distance between the sectors.
 _HALF_WIDTH_RAD, _SECTOR_STEP_RAD = float(np.radians(10.0)), np.radians(5.0)
+_REFERENCE = DetectionFilter(frozenset({"car", "motorcycle", "truck", "bus"}), 0.5, 40.0)
 # Number of clean frames for the health scale, spread over the videos.
 _HEALTH_FRAMES = 10
 # Initial frames of each video that are ignored, because motion detectors learn the background in them.
@@ -71,9 +72,7 @@ class AbsenceSettings:
     """
 
     families: tuple[Family, ...] = FAMILIES
-    keep: DetectionFilter = field(
-        default_factory=lambda: DetectionFilter(frozenset({"car", "motorcycle", "truck", "bus"}), 0.5, 40.0)
-    )
+    keep: DetectionFilter = _REFERENCE
 
     def __post_init__(self) -> None:
         if not self.families or not set(self.families) <= set(FAMILIES):

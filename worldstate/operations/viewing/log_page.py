@@ -20,7 +20,7 @@ from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.adapters.export.other_stacks import CROSSING_M
 from worldstate.adapters.export.scene import CompressedImage, RawAudio, hidden_sector, label_of, sector_of
 from worldstate.adapters.files.file_io import write_text
-from worldstate.ground import InputFileError, InvalidArgumentError, seconds
+from worldstate.ground import InvalidArgumentError, seconds
 from worldstate.operations.recordings.evidence_report import WHY_NOT, common_lines
 from worldstate.state import Entity, RiskCue, WorldState
 from worldstate.state.text import plain, towards
@@ -51,13 +51,6 @@ class PageData(TypedDict):
     states: list[Row]
     images: NotRequired[list[Row]]  # Time and data URI; "image" of a state is an index, -1 before the first
     sound: NotRequired[str]  # Data URI; the sound begins at the first snapshot
-
-
-def check_page(path: Path) -> Path:
-    """Return `path` if it ends in .html or .htm; commands call it before their work."""
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise InputFileError(path, "expected a page's name ending in .html")
-    return path
 
 
 def write_log_page(path: Path, data: PageData) -> None:

@@ -18,7 +18,7 @@ from worldstate.adapters.listener import Step
 from worldstate.adapters.source import Source
 from worldstate.frontend.settings import HOP_RATE_HZ, WINDOW_HOPS
 from worldstate.frontend.stream import FrontEnd
-from worldstate.ground import LEAST_HEARD, InputFileError, seconds
+from worldstate.ground import LEAST_HEARD, seconds
 from worldstate.ground.typing import Float32Array, FloatArray
 from worldstate.operations import figure_style as style
 from worldstate.operations.recordings.recording_report import calibration_words
@@ -279,7 +279,7 @@ def write_animation(
     states: Sequence[WorldState], path: Path, *, title: str = "", on_frame: Callable[[], None] = lambda: None
 ) -> None:
     """Write a GIF of all snapshots from above; it plays at the speed of the recording."""
-    check_gif(path)
+    style.check_suffix(path, *style.ANIMATION)
     from matplotlib.animation import PillowWriter
     from matplotlib.figure import Figure
 
@@ -293,13 +293,6 @@ def write_animation(
                 _draw(figure.subplots(), state, title)
                 writer.grab_frame()
                 on_frame()
-
-
-def check_gif(path: Path) -> Path:
-    """Return `path` if its suffix is .gif; commands call this before their work."""
-    if path.suffix.lower() != ".gif":
-        raise InputFileError(path, "expected an animation's name ending in .gif")
-    return path
 
 
 def draw_state(state: WorldState, axes: "Axes | None" = None) -> "Axes":
