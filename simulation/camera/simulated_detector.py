@@ -10,7 +10,7 @@ import numpy as np
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.ground.typing import BoolArray, FloatArray
-from worldstate.simulation.scene.driving import camera_sees
+from worldstate.simulation.scene.driving import CAMERA, camera_sees
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.kinds import LIGHT, VehicleKind
 from worldstate.simulation.scene.vehicle import ARRAY_HEIGHT_M, LENGTH_M, WIDTH_M, Trajectory
@@ -35,54 +35,46 @@ class SimulatedDetection:
 Frame = tuple[SimulatedDetection, ...]
 
 
-def visible_part(trajectory: Trajectory, site: Site, camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
-    """Return the lateral limits (right, left) of the visible part, (T,); empty if right > left."""
-    ahead, _ = trajectory.behind(0.0)
-    right_limit, left_limit = site.sights_m(ahead, camera.position_m[:2])
-    right, left = trajectory.footprint_y_m()
-    return np.maximum(right, right_limit), np.minimum(left, left_limit)
-
-
-def line_of_sight(
-    trajectory: Trajectory, site: Site, camera: PinholeCamera, ego_x_m: float | FloatArray = 0.0
-) -> BoolArray:
+def line_of_sight(trajectory: Trajectory, site: Site, ego_x_m: float | FloatArray = 0.0) -> BoolArray:
     """Return when the middle of the vehicle's front is in view, shape (T,)."""
-    return camera_sees(site, camera, *trajectory.behind(0.0), ego_x_m)
+    return camera_sees(site, *trajectory.behind(0.0), ego_x_m)
 
 
-def detect(
-    trajectory: Trajectory, site: Site, camera: PinholeCamera, rng: np.random.Generator
-) -> list[Frame]:
+def detect(trajectory: Trajectory, site: Site, rng: np.random.Generator) -> list[Frame]:
     """Return boxes of a passing vehicle, one tuple per frame of `trajectory`."""
-    right, left = visible_part(trajectory, site, camera)
-    seen, kind = line_of_sight(trajectory, site, camera), trajectory.kind
+    ahead, _ = trajectory.behind(0.0)
+    # The lateral limits of the visible part, which is empty if right > left.
+    right, left = trajectory.footprint_y_m()
+    right_limit, left_limit = site.sights_m(ahead, CAMERA.position_m[:2])
+    visible = np.maximum(right, right_limit), np.minimum(left, left_limit)
+    seen, kind = line_of_sight(trajectory, site), trajectory.kind
     frames: list[Frame] = []
-    for x, low, high, sight in zip(trajectory.behind(0.0)[0], right, left, seen, strict=True):
+    for x, low, high, sight in zip(ahead, *visible, seen, strict=True):
         share = (high - low) / min(kind.length_m, LENGTH_M)
         clear = share > LEAST_VISIBLE and (sight or not site.is_open)
-        box = project(camera, site, x, (low, high), kind) if clear else None
+        box = project(CAMERA, site, x, (low, high), kind) if clear else None
         missed = rng.random() < miss_rate(x, 0.5 * (low + high))
         jitter, luck = rng.normal(0.0, BOX_NOISE_PX, 4), rng.normal(0.95, 0.03)
         if box is None or missed:
             frames.append(())
         else:
             score = float(np.clip(luck * (0.75 + 0.25 * min(share, 1.0)), 0.3, 0.999))
-            frames.append((SimulatedDetection(inside(box + jitter, camera), round(score, 4), kind.label),))
+            frames.append((SimulatedDetection(inside(box + jitter, CAMERA), round(score, 4), kind.label),))
     return frames
 
 
-def park(site: Site, camera: PinholeCamera, frames: int, rng: np.random.Generator) -> list[Frame]:
+def park(site: Site, frames: int, rng: np.random.Generator) -> list[Frame]:
     """Return boxes of a car that is parked at the far kerb for the whole recording."""
     x = site.far_kerb_m - 0.5 * WIDTH_M
-    right, left = site.sight_m(x, camera.position_m[:2])
+    right, left = site.sight_m(x, CAMERA.position_m[:2])
     middle = rng.uniform(0.6 * right, 0.6 * left)
     low, high = max(middle - LENGTH_M / 2.0, right), min(middle + LENGTH_M / 2.0, left)
-    box = project(camera, site, x, (low, high))
+    box = project(CAMERA, site, x, (low, high))
     if box is None:
         return [()] * frames
     noise = rng.normal(0.0, PARKED_NOISE_PX, (frames, 4))
     scores = np.clip(rng.normal(0.92, 0.02, frames), 0.3, 0.999).round(4)
-    boxes = (inside(box + one, camera) for one in noise)
+    boxes = (inside(box + one, CAMERA) for one in noise)
     return [(SimulatedDetection(*seen),) for seen in zip(boxes, scores.tolist(), strict=True)]
 
 

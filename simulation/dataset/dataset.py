@@ -24,6 +24,7 @@ from worldstate.ground.typing import Float32Array, FloatArray, ImageArray
 from worldstate.simulation.camera.simulated_detector import Frame, to_json
 from worldstate.simulation.camera.street_view import View, paint_street
 from worldstate.simulation.camera.vehicle_view import PAINTS, Car, add_car, with_parked_car
+from worldstate.simulation.scene.driving import CAMERA
 from worldstate.simulation.scene.junction import MOVING_SITES, PLACES, SITES, Site, place, place_of
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.presets import DEFAULT_PRESET, preset
@@ -63,7 +64,6 @@ class Plan:
     environment: str
     approach: str
     seed: np.random.SeedSequence
-    kind: str = "light"
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ class DatasetSettings:
     kind: str = "light"
     duration_s: float = 10.0
     video: bool = False
-    video_width_px: int = PinholeCamera.ovad().width_px
+    video_width_px: int = CAMERA.width_px
     preset: str = DEFAULT_PRESET
     sounds: tuple[str, ...] = ()
     bandwidth_hz: float | None = None
@@ -125,8 +125,7 @@ class DatasetSettings:
     def __post_init__(self) -> None:
         check_ranges(self, n_static=(0, MAX_RECORDINGS), n_dynamic=(0, MAX_RECORDINGS))
         in_range("n_static + n_dynamic", self.n_static + self.n_dynamic, 1, MAX_RECORDINGS)
-        widest_px = PinholeCamera.ovad().width_px
-        check_ranges(self, seed=(0, 2**63), duration_s=(0.5, 60.0), video_width_px=(64, widest_px))
+        check_ranges(self, seed=(0, 2**63), duration_s=(0.5, 60.0), video_width_px=(64, CAMERA.width_px))
         vehicle_kind(self.kind)
         if self.bandwidth_hz is not None:
             in_range("bandwidth_hz", self.bandwidth_hz, *BANDWIDTHS_HZ)
@@ -144,9 +143,8 @@ class DatasetSettings:
 
     def camera(self) -> PinholeCamera:
         """Return the camera of the video: OVAD's, with images of the chosen width."""
-        whole = PinholeCamera.ovad()
         # The codec requires an even height.
-        height_px = 2 * round(0.5 * whole.height_px * self.video_width_px / whole.width_px)
+        height_px = 2 * round(0.5 * CAMERA.height_px * self.video_width_px / CAMERA.width_px)
         return PinholeCamera.ovad(width_px=self.video_width_px, height_px=height_px)
 
     def plans(self) -> list[Plan]:
@@ -160,10 +158,8 @@ class DatasetSettings:
         children = np.random.SeedSequence(self.seed).spawn(self.n_static + self.n_dynamic)
         groups = (range(self.n_static), self._sites()), (range(self.n_dynamic), MOVING_SITES)
         wanted = [_site_and_approach(i, names) for group, names in groups for i in group]
-        return [
-            Plan(number, *what, child, self.kind)
-            for number, (what, child) in enumerate(zip(wanted, children, strict=True))
-        ]
+        both = enumerate(zip(wanted, children, strict=True))
+        return [Plan(number, *what, child) for number, (what, child) in both]
 
     def _sites(self) -> tuple[str, ...]:
         if self.scene == JUNCTION:
@@ -365,7 +361,7 @@ def _drawn(
     """Return the settings of a recording, and the generator that simulates it."""
     rng = np.random.default_rng(plan.seed)
     levels = replace(preset(wanted.preset), sounds_folder=wanted.sounds_folder)
-    settings = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, plan.kind, levels)
+    settings = draw_settings(plan.environment, plan.approach, rng, wanted.duration_s, wanted.kind, levels)
     if wanted.bandwidth_hz is not None:
         settings = replace(settings, sample_rate_hz=rate_for(wanted.bandwidth_hz))
     if wanted.sounds:
@@ -442,7 +438,7 @@ def camera_frames(
     # The street depends on the site alone. Buildings hide the vehicle until its front crosses the line of
     # sight past their corner, which is the recording's T0. Light and camera do not change, so two images
     # differ only in the vehicle, its shadow and the sensor noise.
-    view = View(camera or PinholeCamera.ovad())
+    view = View(camera or CAMERA)
     paint, parked_paint = (PAINTS[i] for i in rng.integers(len(PAINTS), size=2))
     street = paint_street(settings.site, view)
     if settings.parked_car:
@@ -495,21 +491,21 @@ def parked_middle_m(detections: Iterable[Frame], site: Site) -> float | None:
     still = boxes[(np.abs(boxes - boxes[:1]) < STILL_PX).all(axis=1)] if len(boxes) else boxes
     if not len(still):
         return None
-    camera, faces = PinholeCamera.ovad(), parked_lane_m(site) + WIDTH_M * np.array([-0.5, 0.5])
-    right, left = site.sights_m(faces, camera.position_m[:2])
+    faces = parked_lane_m(site) + WIDTH_M * np.array([-0.5, 0.5])
+    right, left = site.sights_m(faces, CAMERA.position_m[:2])
     middles = np.arange(right[0], left[0], STEP_M)
     ends = np.clip(middles[:, None, None] + LENGTH_M * np.array([[-0.5], [0.5]]), right, left)
     wanted = np.median(still, axis=0)[[0, 2]]
-    missed = np.abs(_columns_px(camera, faces, ends) - wanted).sum(axis=1)
+    missed = np.abs(_columns_px(faces, ends) - wanted).sum(axis=1)
     return float(middles[missed.argmin()])
 
 
-def _columns_px(camera: PinholeCamera, ahead_m: FloatArray, ends_m: FloatArray) -> FloatArray:
+def _columns_px(ahead_m: FloatArray, ends_m: FloatArray) -> FloatArray:
     """Return the first and last column of n cuboids, (n, 2), from two faces (2,) and their ends (n, 2, 2)."""
     # At the height of the camera, its pitch only shortens the depth.
-    slope = (ends_m - camera.position_m[1]) / ((ahead_m - camera.position_m[0]) * np.cos(camera.pitch_rad))
-    focal = 0.5 * camera.width_px / np.tan(camera.half_angle_rad)
-    columns = np.clip(0.5 * camera.width_px - focal * slope, 0.0, camera.width_px - 1.0).reshape(-1, 4)
+    slope = (ends_m - CAMERA.position_m[1]) / ((ahead_m - CAMERA.position_m[0]) * np.cos(CAMERA.pitch_rad))
+    focal = 0.5 * CAMERA.width_px / np.tan(CAMERA.half_angle_rad)
+    columns = np.clip(0.5 * CAMERA.width_px - focal * slope, 0.0, CAMERA.width_px - 1.0).reshape(-1, 4)
     return np.stack([columns.min(axis=1), columns.max(axis=1)], axis=1)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import soundfile
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, TRUTH_NAME
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError
@@ -221,11 +220,10 @@ def simulate_recording(
     array = ovad_array() if array is None else array
     with threadpool_limits(1):  # The number of BLAS threads would change the last bits
         audio = _record(settings, array, to_sound)
-    camera = PinholeCamera.ovad()
     frames = np.arange(max(round(settings.duration_s * FRAME_RATE_HZ), 1)) / FRAME_RATE_HZ
     seen = [path.at(frames) for path in trajectories(settings, _knots(settings))]
     ego_x = settings.ego.x_m(frames)
-    sights = [line_of_sight(path, settings.site, camera, ego_x) for path in seen]
+    sights = [line_of_sight(path, settings.site, ego_x) for path in seen]
     return SimulatedRecording(
         audio=audio,
         sample_rate_hz=settings.sample_rate_hz,
@@ -294,11 +292,11 @@ def _detections(
 ) -> tuple[Frame, ...]:
     if not settings.ego.stands:
         return ()
-    camera, boxes = PinholeCamera.ovad(), list[Frame]([()] * frames)
+    boxes = list[Frame]([()] * frames)
     if settings.parked_car:
-        boxes = park(settings.site, camera, frames, rng)
+        boxes = park(settings.site, frames, rng)
     for path in seen:
-        passing = detect(path, settings.site, camera, rng)
+        passing = detect(path, settings.site, rng)
         boxes = [standing + moving for standing, moving in zip(boxes, passing, strict=True)]
     showers = ((sound.start_s, sound.end_s, sound.lens_missed) for sound in settings.sounds)
     return tuple(through_rain(boxes, showers, rng))

@@ -13,7 +13,7 @@ from worldstate.simulation.scene.vehicle import Trajectory, emit
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.diffraction import screen_attenuation_db
 from worldstate.simulation.sound.propagation import ANY_ORDER, add_sources
-from worldstate.simulation.sound.renderers import RENDERERS
+from worldstate.simulation.sound.renderers import ADD_SOURCE
 from worldstate.simulation.sound.scatter import add_scattered
 from worldstate.simulation.sound.static_field import StreetSound, add_late_sound
 
@@ -36,8 +36,8 @@ def add_vehicle(street: StreetSound, path: Trajectory, rng: np.random.Generator)
     whole = np.sum([one.signal for one in parts], axis=0)
     middle = 0.5 * (path.kind.axles_m[0] + path.kind.axles_m[-1])
     point = street.source(whole, path.time_s, path.behind(middle))
-    if renderer := RENDERERS.get(site.renderer):
-        renderer.add_source(street, point, rng)
+    if add_source := ADD_SOURCE.get(site.renderer):
+        add_source(street, point, rng)
         return
     near = [street.source(one.signal, path.time_s, path.behind(one.behind_m), one.height_m) for one in parts]
     add_sources(street, near, ANY_ORDER[:POINT_REFLECTIONS])
@@ -109,15 +109,15 @@ def _add_from(
     to_ego = street.receiver.ego.x_m(time_s) - x
     angle = np.arctan2(-y, to_ego) - facing_rad
     towards = _gained(signal, directivity(kind, angle), rate) * GROUND_GAIN
-    renderer = RENDERERS.get(site.renderer)
-    if not (renderer and renderer.over_roofs) and not in_the_streets(site, x, y).all():
+    # Rays carry sound over roofs.
+    if site.renderer != "rays" and not in_the_streets(site, x, y).all():
         over = _gained(towards, over_roofs(street, np.hypot(to_ego, y), kind.height_m), rate)
         beyond = street.source(over, time_s, place_m, kind.height_m)
         add_sources(replace(street, site=in_the_open(site)), [beyond])
         return
     source = street.source(towards, time_s, place_m, kind.height_m)
-    if renderer:
-        renderer.add_source(street, source, rng)
+    if add_source := ADD_SOURCE.get(site.renderer):
+        add_source(street, source, rng)
         return
     add_sources(street, [source])
     mean = _gained(signal, np.broadcast_to(mean_gain(kind), (len(angle), 8)), rate) * GROUND_GAIN

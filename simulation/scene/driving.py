@@ -11,35 +11,24 @@ from .occluders import hidden_by
 from .settings import SimulationSettings, VehicleSettings
 from .vehicle import Trajectory, along, drive, follow
 
-
-def image_edges_rad(camera: PinholeCamera) -> tuple[float, float]:
-    """Return the azimuths (right, left) of the edges of the image, seen from the camera.
-
-    Examples
-    --------
-    >>> [round(float(edge), 3) for edge in image_edges_rad(PinholeCamera.ovad())]
-    [-0.597, 0.597]
-    """
-    right, left = camera.off_axis(camera.azimuth([camera.width_px, 0.0])) + camera.yaw_rad
-    return float(right), float(left)
+CAMERA = PinholeCamera.ovad()  # The camera of every simulated ego
+# Azimuths of the right and the left edge of its image, seen from the camera.
+RIGHT_EDGE_RAD, LEFT_EDGE_RAD = CAMERA.off_axis(CAMERA.azimuth([CAMERA.width_px, 0.0])) + CAMERA.yaw_rad
 
 
-def camera_sees(
-    site: Site, camera: PinholeCamera, x_m: FloatArray, y_m: FloatArray, ego_x_m: float | FloatArray = 0.0
-) -> BoolArray:
+def camera_sees(site: Site, x_m: FloatArray, y_m: FloatArray, ego_x_m: float | FloatArray = 0.0) -> BoolArray:
     """Return when the camera sees a moving point, shape (T,).
 
     Examples
     --------
     >>> from worldstate.simulation.scene.junction import site
     >>> x, y = np.array([8.0, 8.0, 2.0, -8.0]), np.array([3.0, 8.0, 2.5, 0.0])
-    >>> camera_sees(site("SA1"), PinholeCamera.ovad(), x, y)
+    >>> camera_sees(site("SA1"), x, y)
     array([ True, False, False, False])
     """
-    eye = (ego_x_m + camera.position_m[0], camera.position_m[1])
-    right_edge, left_edge = image_edges_rad(camera)
+    eye = (ego_x_m + CAMERA.position_m[0], CAMERA.position_m[1])
     direction = np.arctan2(y_m - eye[1], x_m - eye[0])
-    pictured = (direction > right_edge) & (direction < left_edge)
+    pictured = (direction > RIGHT_EDGE_RAD) & (direction < LEFT_EDGE_RAD)
     right, left = site.sights_m(x_m, eye)
     # In the open, and on this side of the corners, no corner hides the point.
     past_corners = site.is_open | (x_m <= site.corner_ahead_m) | ((y_m > right) & (y_m < left))
@@ -75,10 +64,10 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
 
 def entry_y_m(site: Site, lane_m: float, approach: str, ego_x_m: float = 0.0) -> float:
     """Return the y in its lane at which the camera first sees a vehicle from the left or the right."""
-    eye_x, eye_y, _ = PinholeCamera.ovad().position_m
+    eye_x, eye_y, _ = CAMERA.position_m
     right, left = site.sight_m(lane_m, (ego_x_m + eye_x, eye_y))
     ahead = lane_m - ego_x_m - eye_x
-    right_edge, left_edge = (eye_y + ahead * np.tan(edge) for edge in image_edges_rad(PinholeCamera.ovad()))
+    right_edge, left_edge = (eye_y + ahead * np.tan(edge) for edge in (RIGHT_EDGE_RAD, LEFT_EDGE_RAD))
     return float(min(left, left_edge) if approach == "left" else max(right, right_edge))
 
 
@@ -99,7 +88,7 @@ def _first_sight(site: Site, vehicle: VehicleSettings) -> tuple[float, str]:
     length = float(np.hypot(*np.diff(np.array(vehicle.route_m), axis=0).T).sum())
     driven = np.arange(0.0, length, SEARCH_STEP_M)
     x, y = route.at(driven)
-    seen = camera_sees(site, PinholeCamera.ovad(), x, y)
+    seen = camera_sees(site, x, y)
     if seen.any() and not seen[0]:
         return float(driven[_longest_begins(seen)]), "hidden at first"
     return float(driven[np.hypot(x, y).argmin()]), "in view at first" if seen.any() else "never"

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.ground import BoolArray, FloatArray
 from worldstate.simulation.camera import simulated_detector as detector
 from worldstate.simulation.dataset.recording import SCHEMA, SCHEMA_VERSION
+from worldstate.simulation.scene.driving import CAMERA
 from worldstate.simulation.scene.junction import Site
 from worldstate.simulation.scene.vehicle import EgoMotion
 
@@ -32,7 +32,7 @@ def visible_s(event: VehicleEvent, site: Site, ego: EgoMotion = STANDING) -> flo
     """Return the time at which a vehicle first comes into view; None if it never does."""
     clock = np.arange(0.0, event.manoeuvre.motion.duration_s, CLOCK_S)
     path, ego_x = event.manoeuvre.motion.trajectory(clock), ego.x_m(event.start_s + clock)
-    seen = detector.line_of_sight(path, site, PinholeCamera.ovad(), ego_x)
+    seen = detector.line_of_sight(path, site, ego_x)
     return round(event.start_s + float(clock[seen.argmax()]), 6) if seen.any() else None
 
 
@@ -43,11 +43,11 @@ def detected_frames(
     rng: np.random.Generator,
 ) -> list[detector.Frame]:
     """Return boxes of a whole stream: vehicles with misses, some parked cars, clutter; rain removes some."""
-    camera, to_park, to_clutter, to_vehicles, to_rain = PinholeCamera.ovad(), *rng.spawn(4)
+    to_park, to_clutter, to_vehicles, to_rain = rng.spawn(4)
     count = max(round(settings.duration_s * FRAME_RATE_HZ), 1)
     frames: list[detector.Frame] = [()] * count
     if to_park.random() < PARKED_SHARE:
-        frames = detector.park(settings.site, camera, count, to_park)
+        frames = detector.park(settings.site, count, to_park)
     for event, draws in zip(events, to_vehicles.spawn(len(events)), strict=True):
         _add_boxes(frames, event, settings.site, draws)
     _add_clutter(frames, to_clutter)
@@ -63,20 +63,19 @@ def _add_boxes(
     path = event.manoeuvre.motion.trajectory(numbers / FRAME_RATE_HZ - event.start_s)
     # Objects beside or behind the camera are not in the image.
     ahead = path.behind(0.0)[0] > NEAREST_BOX_M
-    boxes = detector.detect(path.at(path.time_s[ahead]), site, PinholeCamera.ovad(), rng)
+    boxes = detector.detect(path.at(path.time_s[ahead]), site, rng)
     for number, seen in zip(numbers[ahead].tolist(), boxes, strict=True):
         frames[number] += seen
 
 
 def _add_clutter(frames: list[detector.Frame], rng: np.random.Generator) -> None:
-    camera = PinholeCamera.ovad()
     for _ in range(rng.poisson(CLUTTER_PER_HOUR * len(frames) / FRAME_RATE_HZ / 3600.0)):
         first = int(rng.integers(len(frames)))
         width = rng.uniform(*CLUTTER_WIDTH_PX)
         height = width * rng.uniform(*CLUTTER_SHAPE)
-        left = rng.uniform(0.0, camera.width_px - width)
+        left = rng.uniform(0.0, CAMERA.width_px - width)
         # False boxes are near the horizon, like the vehicles that a detector reports.
-        top = rng.uniform(0.3, 0.7) * (camera.height_px - height)
+        top = rng.uniform(0.3, 0.7) * (CAMERA.height_px - height)
         left, top, right, bottom = (round(float(v), 1) for v in (left, top, left + width, top + height))
         score = round(float(rng.uniform(*CLUTTER_SCORE)), 4)
         box = detector.SimulatedDetection((left, top, right, bottom), score)
@@ -136,7 +135,7 @@ def vehicle_truth(number: int, event: VehicleEvent, settings: StreamSettings) ->
         axle_rad=np.arctan2(axle_y, axle_x - ego_x),
         axle_m=np.hypot(axle_x - ego_x, axle_y),
         speed_mps=path.speed_mps,
-        in_view=detector.line_of_sight(path, settings.site, PinholeCamera.ovad(), ego_x),
+        in_view=detector.line_of_sight(path, settings.site, ego_x),
     )
 
 

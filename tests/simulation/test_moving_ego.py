@@ -48,7 +48,7 @@ from worldstate.simulation.sound import ego_sound, scatter
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import add_turning, passed_places
-from worldstate.simulation.sound.renderers import RENDERERS
+from worldstate.simulation.sound.renderers import ADD_SOURCE
 from worldstate.simulation.sound.scatter import add_scattered
 from worldstate.simulation.stream.arrivals import STANDING, VehicleEvent
 from worldstate.simulation.stream.manoeuvres import Driver, emerges
@@ -390,7 +390,7 @@ def carried_past(
     street = street_of(plan, positions, len(signal) / rate_hz + 1e-6, rate_hz, ego, preset())
     x, y = (np.full(len(street.receiver.knots_s), one) for one in place_m)
     source = street.source(signal.astype(np.float32), street.receiver.knots_s, (x, y))
-    RENDERERS[plan.renderer].add_source(street, source, np.random.default_rng(1))
+    ADD_SOURCE[plan.renderer](street, source, np.random.default_rng(1))
     return rendered(street)
 
 

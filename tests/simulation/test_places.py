@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 from simulated_sound import PAIR, QUIET, apart_deg, made, srp_spectrum
 
-from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.files.array_file import read_array
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.simulation import (
@@ -28,10 +27,9 @@ from worldstate.simulation import (
 )
 from worldstate.simulation.camera.simulated_detector import line_of_sight
 from worldstate.simulation.dataset.recording import describe
-from worldstate.simulation.scene.driving import trajectories
+from worldstate.simulation.scene.driving import CAMERA, trajectories
 from worldstate.simulation.scene.junction import place_of
 
-CAMERA = PinholeCamera.ovad()
 TIME_S = np.arange(-2.0, 12.0, 0.05)
 FRAMES_S = np.arange(0.0, 10.0, 0.1)
 
@@ -69,7 +67,7 @@ def seen_step_by_step(plan, x: float, y: float) -> bool:
 def told(scene: SimulationSettings) -> dict:
     """Return the truth of a recording without its sound."""
     seen = [path.at(FRAMES_S) for path in trajectories(scene, TIME_S)]
-    sights = [line_of_sight(path, scene.site, CAMERA) for path in seen]
+    sights = [line_of_sight(path, scene.site) for path in seen]
     return json.loads(json.dumps(describe(scene, FRAMES_S, seen, sights), allow_nan=False))
 
 

@@ -202,7 +202,7 @@ def test_the_position_of_the_parked_car_follows_from_its_boxes(seed, name):
     plan = site(name)
     right, left = plan.sight_m(parked_lane_m(plan), PinholeCamera.ovad().position_m[:2])
     middle = np.random.default_rng(seed).uniform(0.6 * right, 0.6 * left)
-    found = parked_middle_m(park(plan, PinholeCamera.ovad(), 20, rng), plan)
+    found = parked_middle_m(park(plan, 20, rng), plan)
     # A car that the line of sight cuts off has one true end in its box, which is in the image.
     assert found == pytest.approx(middle, abs=0.25)
 
