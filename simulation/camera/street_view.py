@@ -264,13 +264,12 @@ class Facade:
 
     colour: Colour  # Colour of the brick
     bay_m: float  # Distance between windows
-    foot_m: float  # Coordinate of the ground
     brightness: float  # Brightness of the incident light
     seed: int  # Seed of the house
 
     def paint(self, a: Float32Array, b: Float32Array) -> Float32Array:
         """Return the colours at positions along the wall and upwards."""
-        up = b - np.float32(self.foot_m)
+        up = b - np.float32(ROAD_Z_M)
         image = brick(a, up, self.colour, self.seed)
         bay, storey = np.floor(a / self.bay_m), np.floor(up / STOREY_M)
         x = a - (bay + 0.5) * np.float32(self.bay_m)
@@ -335,10 +334,10 @@ def street_panels(site: Site) -> list[Panel]:
     rng = site_generator(site.name, "look")
     seeds = rng.integers(0, 1 << 16, 8).tolist()
     colours = rng.permutation(len(BRICKS)).tolist()
-    left = Facade(BRICKS[colours[0]], rng.uniform(2.6, 3.4), ROAD_Z_M, 0.85, seeds[0])
-    right = Facade(BRICKS[colours[1]], rng.uniform(2.6, 3.4), ROAD_Z_M, 0.8, seeds[1])
+    left = Facade(BRICKS[colours[0]], rng.uniform(2.6, 3.4), 0.85, seeds[0])
+    right = Facade(BRICKS[colours[1]], rng.uniform(2.6, 3.4), 0.8, seeds[1])
     heights = rng.uniform(6.0, 8.5, 3)
-    front = Facade(BRICKS[colours[2]], rng.uniform(2.8, 3.6), ROAD_Z_M, 0.95, seeds[3])
+    front = Facade(BRICKS[colours[2]], rng.uniform(2.8, 3.6), 0.95, seeds[3])
     return [
         Panel(2, ROAD_Z_M, ((-5.0, FAR_M), (-FAR_M, FAR_M)), _Ground(site, seeds[2]).paint),
         *_building(site, 1.0, left, heights[0]),
@@ -353,7 +352,7 @@ def _building(site: Site, side: float, front: Facade, height_m: float) -> list[P
     corner = site.corner_left_m if side > 0 else site.corner_right_m
     start, end = site.corner_ahead_m - PIER_M, site.corner_ahead_m
     up = (ROAD_Z_M, ROAD_Z_M + height_m)
-    plain = Facade(front.colour, 1e6, ROAD_Z_M, front.brightness, front.seed)
+    plain = Facade(front.colour, 1e6, front.brightness, front.seed)
     depth = (min(side * corner, side * wall), max(side * corner, side * wall))
     return [
         Panel(1, side * wall, ((-20.0, start), up), front.paint),

@@ -70,22 +70,17 @@ def test_the_bearing_of_a_sound_is_that_of_its_place(kind, azimuth):
     assert apart_deg(found_deg, azimuth) <= 4.0
 
 
-@settings(max_examples=3, deadline=None)
-@given(st.floats(6.0, 14.0), st.floats(2.0, 4.0), st.floats(0.0, 360.0))
-def test_pressure_falls_with_distance(range_m, factor, azimuth):
-    """1/r and air absorption; birds are too high for interference with the road, 3.3 m above the array."""
-    near, far = (heard(placed("birds", azimuth, r)) for r in (range_m, factor * range_m))
-    lost = level_db(near) - level_db(far)
-    spread = 20 * np.log10(np.hypot(factor * range_m, 3.3) / np.hypot(range_m, 3.3))
-    assert lost == pytest.approx(spread, abs=0.3 + 0.04 * factor * range_m)
-
-
-def test_hard_ground_adds_three_decibels():
-    """The road reflects as much again; birds are too high for interference. Air takes 0.3 dB."""
+@settings(max_examples=6, deadline=None)
+@given(st.floats(6.0, 56.0), st.floats(0.0, 360.0))
+def test_pressure_falls_with_distance_above_hard_ground(range_m, azimuth):
+    """The road doubles the energy: birds are too high for interference, 3.3 m above the array."""
     dry = emitted(sound_kind("birds"), int(FS), FS, np.random.default_rng(1))
-    signal = heard(placed("birds", 0.0, 15.0), seed=1, seconds=1.2)[0]
+    signal = heard(placed("birds", azimuth, range_m), seconds=1.3)[0]
     found = 10 * np.log10(np.square(signal).sum() / np.square(dry).sum())
-    assert found == pytest.approx(3.0 - 20 * np.log10(np.hypot(15.0, 3.3)) - 0.3, abs=0.7)
+    # Air takes some hundredths of a decibel per metre, and far away a little interference is left.
+    assert found == pytest.approx(
+        3.0 - 20 * np.log10(np.hypot(range_m, 3.3)) - 0.02 * range_m, abs=0.4 + 0.015 * range_m
+    )
 
 
 @pytest.mark.parametrize("kind", ["voice", "music", "horn"])

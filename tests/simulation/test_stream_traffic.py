@@ -29,6 +29,7 @@ from worldstate.simulation.stream.settings import HAZARDS, RAIN_DB, StreamSettin
 from worldstate.simulation.stream.truth import (
     CLUTTER_IMAGES,
     CLUTTER_PER_HOUR,
+    VehicleTruth,
     describe_events,
     detected_frames,
     vehicle_truth,
@@ -38,19 +39,25 @@ from worldstate.simulation.stream.truth import (
 NEVER_SEEN = {"turns_away", "parks", "far", "distant"}
 
 
-def events_of(name: str, where: str, seed: int, duration_s: float = 3600.0) -> list[VehicleEvent]:
-    settings = StreamSettings(site(where), duration_s / 60.0, traffic=traffic_named(name))
+def stream(where: str, traffic: str | Traffic, minutes: float = 60.0) -> StreamSettings:
+    return StreamSettings(
+        site(where), minutes, traffic=traffic_named(traffic) if isinstance(traffic, str) else traffic
+    )
+
+
+def events_of(settings: StreamSettings, seed: int) -> list[VehicleEvent]:
     return draw_events(settings, np.random.default_rng(seed))
+
+
+def truths_of(settings: StreamSettings, seed: int) -> list[VehicleTruth]:
+    return [vehicle_truth(i, event, settings) for i, event in enumerate(events_of(settings, seed))]
 
 
 def test_counts_of_every_flow_are_poisson_over_seeds() -> None:
     rates = {"left": 120.0, "far": 300.0, "turns_away": 60.0}
     seeds, hours = 40, 0.05
-    settings = StreamSettings(site("SB1"), 60.0 * hours, traffic=Traffic("test", rates))
-    counts = [
-        Counter(e.flow for e in draw_events(settings, rng))
-        for rng in map(np.random.default_rng, range(seeds))
-    ]
+    settings = stream("SB1", Traffic("test", rates), 60.0 * hours)
+    counts = [Counter(e.flow for e in events_of(settings, seed)) for seed in range(seeds)]
     for flow, rate in rates.items():
         number = np.array([count[flow] for count in counts])
         expected = rate * hours
@@ -61,9 +68,7 @@ def test_counts_of_every_flow_are_poisson_over_seeds() -> None:
 
 @pytest.mark.parametrize("name", ["SA1", "SB1"])
 def test_a_busy_hour_has_every_event_and_only_hazards_leave_an_arm(name: str) -> None:
-    settings = StreamSettings(site(name), 60.0, traffic=traffic_named("busy"))
-    events = events_of("busy", name, seed=1)
-    vehicles = [vehicle_truth(number, event, settings) for number, event in enumerate(events)]
+    vehicles = truths_of(stream(name, "busy"), seed=1)
     told = describe_events(vehicles, (), {})["vehicles"]
     assert {one["flow"] for one in told} == {*traffic_named("busy").per_hour, "follows"}
     assert {one["kind"] for one in told} >= {"light", "medium", "heavy", "electric", "bicycle"}
@@ -80,7 +85,7 @@ def test_a_busy_hour_has_every_event_and_only_hazards_leave_an_arm(name: str) ->
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_approaches_have_the_requested_numbers_in_turn(seed: int) -> None:
-    events = events_of("approaches", "SB1", seed, duration_s=864.0)
+    events = events_of(stream("SB1", "approaches", 14.4), seed)
     counts = Counter(event.flow for event in events if event.flow in (*HAZARDS, "follows"))
     assert counts == {"left": 10, "right": 10, "both": 20, "queue": 6, "follows": 6}
     entries = [visible_s(event, site("SB1")) for event in events if event.flow in HAZARDS]
@@ -90,7 +95,7 @@ def test_approaches_have_the_requested_numbers_in_turn(seed: int) -> None:
 
 
 def test_followers_keep_their_headway_and_pairs_arrive_together() -> None:
-    events = events_of("busy", "SB1", seed=3)
+    events = events_of(stream("SB1", "busy"), seed=3)
     together = [[visible_s(e, site("SB1")) for e in events if e.flow == "both" and e.manoeuvre.arm == arm]
                 for arm in ("left", "right")]  # fmt: skip
     left, right = (np.sort(np.array(times, dtype=float)) for times in together)
@@ -107,7 +112,7 @@ def test_followers_keep_their_headway_and_pairs_arrive_together() -> None:
 
 
 def test_traffic_without_hazards_leaves_other_flows_unchanged() -> None:
-    quiet, busy = events_of("no-hazard", "SA1", 5), events_of("busy", "SA1", 5)
+    quiet, busy = (events_of(stream("SA1", name), 5) for name in ("no-hazard", "busy"))
     others = [e for e in busy if e.flow not in {*HAZARDS, "follows"}]
     assert traffic_named("no-hazard").hazard_free and not traffic_named("busy").hazard_free
     assert [(e.flow, e.start_s) for e in quiet] == [(e.flow, e.start_s) for e in others]
@@ -126,8 +131,7 @@ def test_time_to_visible_at_constant_speed_is_distance_over_speed(
     plan = site(where)
     driver = Driver(plan, vehicle_kind(kind), arm, speed, 0.0, 40.0)
     event = VehicleEvent(arm, emerges(driver, np.random.default_rng(0)), start_s)
-    settings = StreamSettings(plan, 2.0)
-    truth = vehicle_truth(0, event, settings)
+    truth = vehicle_truth(0, event, StreamSettings(plan, 2.0))
     # The line from the eye past the corner, by similar triangles.
     eye_x, eye_y, _ = PinholeCamera.ovad().position_m
     corner = plan.corner_left_m if arm == "left" else -plan.corner_right_m
@@ -177,13 +181,12 @@ def test_a_preset_scales_the_speed_of_vehicles_and_not_of_bicycles(
 
 
 def test_boxes_have_the_rates_of_misses_and_clutter() -> None:
-    settings = StreamSettings(site("SB1"), 10.0, traffic=Traffic("test", {"left": 240.0}, kinds={"light": 1}))
-    events = draw_events(settings, np.random.default_rng(2))
+    settings = stream("SB1", Traffic("test", {"left": 240.0}, kinds={"light": 1}), 10.0)
+    vehicles, events = truths_of(settings, 2), events_of(settings, 2)
     frames = detected_frames(settings, events, [], np.random.default_rng(1))
     alone = detected_frames(settings, [], [], np.random.default_rng(1))
     assert len(frames) == len(alone) == 6000
     added = np.array([len(a) - len(b) for a, b in zip(frames, alone, strict=True)])
-    vehicles = [vehicle_truth(i, event, settings) for i, event in enumerate(events)]
     seen = np.zeros(len(frames), dtype=int)
     for one in vehicles:
         seen[np.rint(10 * one.time_s[one.in_view]).astype(int)] += 1
@@ -198,8 +201,7 @@ def test_boxes_have_the_rates_of_misses_and_clutter() -> None:
 
 def test_other_sounds_have_their_rate_and_rain_removes_boxes() -> None:
     rates = {"rain": 60.0, "voice": 240.0, "siren": 30.0}
-    traffic = replace(traffic_named("busy"), sounds=rates)
-    settings = StreamSettings(site("SB1"), 60.0, traffic=traffic)
+    settings = stream("SB1", replace(traffic_named("busy"), sounds=rates))
     sounds = draw_sounds(settings, [4], np.random.default_rng(1))
     for kind, rate in rates.items():
         number = sum(one.sound.kind == kind for one in sounds)
@@ -215,12 +217,11 @@ def test_other_sounds_have_their_rate_and_rain_removes_boxes() -> None:
 
 @pytest.mark.parametrize("where", ["SA1", "SB3"])
 def test_a_stop_lasts_2_to_10_s_before_line_of_sight(where: str) -> None:
-    settings = StreamSettings(site(where), 60.0, traffic=traffic_named("stops"))
     stopped_s = []
-    for number, event in enumerate(draw_events(settings, np.random.default_rng(1))):
-        truth = vehicle_truth(number, event, settings)
-        clock = np.arange(0.0, event.manoeuvre.motion.duration_s, 0.01)
-        still = clock[event.manoeuvre.motion.trajectory(clock).speed_mps < 1e-3]
+    for truth in truths_of(stream(where, "stops"), 1):
+        event, motion = truth.event, truth.event.manoeuvre.motion
+        clock = np.arange(0.0, motion.duration_s, 0.01)
+        still = clock[motion.trajectory(clock).speed_mps < 1e-3]
         stopped_s.append(np.ptp(still))
         assert truth.hazard
         assert truth.t0_s is not None
@@ -232,12 +233,11 @@ def test_a_stop_lasts_2_to_10_s_before_line_of_sight(where: str) -> None:
 
 
 def test_a_town_has_each_flow_and_distant_vehicles_stay_hidden() -> None:
-    settings = StreamSettings(site("SB1"), 60.0, traffic=traffic_named("town-varied"))
-    events = draw_events(settings, np.random.default_rng(2))
-    flows = Counter(event.flow for event in events)
+    vehicles = truths_of(stream("SB1", "town-varied"), 2)
+    flows = Counter(one.event.flow for one in vehicles)
     usual = {"left", "right", "both", "queue", "follows", "stops", "turns_away", "far", "parks", "distant"}
     assert usual <= set(flows)
-    distant = [vehicle_truth(i, one, settings) for i, one in enumerate(events) if one.flow == "distant"]
+    distant = [one for one in vehicles if one.event.flow == "distant"]
     assert all(one.t0_s is None and not one.hazard for one in distant)
     away_m = [float(np.abs(one.y_m).mean()) for one in distant if len(one.y_m)]
     assert len(away_m) > 20
@@ -248,7 +248,7 @@ def test_a_town_has_each_flow_and_distant_vehicles_stay_hidden() -> None:
 @pytest.mark.parametrize("weather", ["gusts", "rain"])
 def test_gusts_and_rain_leave_the_vehicles_unchanged(weather: str) -> None:
     for name in ("pairs", "no-hazard"):
-        dry, wet = (events_of(one, "SA1", 7) for one in (name, f"{name}-{weather}"))
+        dry, wet = (events_of(stream("SA1", one), 7) for one in (name, f"{name}-{weather}"))
         assert [(e.flow, e.start_s, e.end_s) for e in dry] == [(e.flow, e.start_s, e.end_s) for e in wet]
 
 
@@ -256,7 +256,7 @@ def test_a_louder_background_reduces_the_range_and_not_the_sight() -> None:
     usual, louder = (
         {
             round(e.start_s + e.manoeuvre.arrives_s, 6): e.manoeuvre.arrives_s
-            for e in draw_events(StreamSettings(site("SB1"), 30.0, traffic=one), np.random.default_rng(7))
+            for e in events_of(stream("SB1", one, 30.0), 7)
         }
         for one in (traffic_named("pairs"), replace(traffic_named("pairs"), background_db=(20.0, 20.0)))
     )
@@ -285,8 +285,8 @@ def test_background_levels_are_uniform_and_rain_has_its_share() -> None:
 
 def test_signals_belong_to_vehicles_and_bells_to_bicycles() -> None:
     shares = {"siren": 0.3, "bicycle-bell": 0.5}
-    settings = StreamSettings(site("SB1"), 120.0, traffic=replace(traffic_named("busy"), signals=shares))
-    events = draw_events(settings, np.random.default_rng(4))
+    settings = stream("SB1", replace(traffic_named("busy"), signals=shares), 120.0)
+    events = events_of(settings, 4)
     leaders = [event for event in events if event.flow not in ("follows", "far")]
     riders = {
         rides: [one for one in leaders if (one.manoeuvre.motion.kind.name in ("bicycle", "scooter")) == rides]
