@@ -1,5 +1,7 @@
 """Motion from settings: the position of every vehicle, and when the camera of the ego sees it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -9,7 +11,7 @@ from .junction import Site
 from .kinds import vehicle_kind
 from .occluders import hidden_by
 from .settings import SimulationSettings, VehicleSettings
-from .vehicle import Trajectory, along, drive, follow
+from .vehicle import Trajectory, along, drive
 
 CAMERA = PinholeCamera.ovad()  # The camera of every simulated ego
 # Azimuths of the right and the left edge of its image, seen from the camera.
@@ -56,10 +58,11 @@ def _trajectory(settings: SimulationSettings, vehicle: VehicleSettings, time_s: 
         braking_mps2=vehicle.braking_mps2,
         kind=vehicle_kind(vehicle.kind),
     )
-    if vehicle.route_m:
-        way = along(vehicle.route_m, _first_sight(settings.site, vehicle)[0])
-        return follow(passing, entry_y, way)
-    return passing
+    if not vehicle.route_m:
+        return passing
+    route = along(vehicle.route_m, _first_sight(settings.site, vehicle)[0])
+    driven = (passing.front_y_m - entry_y) * passing.heading
+    return replace(passing, front_y_m=route.at(driven)[1], route=route, driven_m=driven)
 
 
 def entry_y_m(site: Site, lane_m: float, approach: str, ego_x_m: float = 0.0) -> float:

@@ -445,7 +445,6 @@ NEAR_M, SIDE_STREET_M = (3.0, 12.0), (6.0, 30.0)  # Behind the ego, and along th
 FAR_M, BELL_M = (60.0, 200.0), (80.0, 250.0)
 FROM_WALL_M = 0.6
 LENS_SHARE, LENS_MISSED = 0.5, (0.2, 0.8)  # Half of the rain wets the lens, too
-MAX_GUSTY = 3
 # Duration of a swell of wind, and its level above the mean wind of the site, dB (assumed).
 SWELL_S, SWELL_DB = (1.0, 5.0), (8.0, 25.0)
 
@@ -476,7 +475,7 @@ def _drawn(
     long = whole if kind in LASTING else max(whole * rng.uniform(*SHARE), 0.05)
     start = rng.uniform(0.0, whole - long) if long < whole else 0.0
     if kind == "gusts":
-        count = int(rng.integers(1, min(MAX_GUSTY, microphones) + 1))
+        count = int(rng.integers(1, min(MAX_CHANNELS, microphones) + 1))
         # A gust is narrow: it hits neighbouring microphones.
         first = int(rng.integers(microphones - count + 1))
         return SoundSettings(kind, start, long, channels=tuple(range(first, first + count)))

@@ -201,12 +201,6 @@ def drive(
     return Trajectory(time_s, front[asked], speed[asked], lane_x_m, heading, kind)
 
 
-def follow(passing: Trajectory, entry_y_m: float, route: Route) -> Trajectory:
-    """Return the motion of `passing` along another route."""
-    driven = (passing.front_y_m - entry_y_m) * passing.heading
-    return replace(passing, front_y_m=route.at(driven)[1], route=route, driven_m=driven)
-
-
 def rolling_level_db(speed_mps: FloatArray, kind: VehicleKind = LIGHT) -> FloatArray:
     """Return the sound power level of the tyres, L = A + B log10(v / 70 km/h), shape (8, T)."""
     speed_kmh = np.maximum(3.6 * speed_mps, SLOWEST_KMH)

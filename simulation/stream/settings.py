@@ -62,9 +62,8 @@ class Traffic:
             in_range("apart_s", self.apart_s, 0.0, 10.0)
         in_range("background_db[0]", self.background_db[0], -40.0, self.background_db[1])
         in_range("background_db[1]", self.background_db[1], -40.0, 30.0)
-        in_range("rain_share", self.rain_share, 0.0, 1.0)
-        # A share of one would make an endless queue.
-        in_range("follower_share", self.follower_share, 0.0, 0.9)
+        # A share of followers of one would make an endless queue.
+        check_ranges(self, rain_share=(0.0, 1.0), follower_share=(0.0, 0.9))
         in_range("kinds: sum of the shares", sum(self.kinds.values()), 1e-6, 1e6)
 
     @property
