@@ -85,7 +85,7 @@ def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray],
 
     def figures(rows: IndexArray) -> Figures:
         scored = rows[(hazards | hazard_free)[rows]]
-        labels, score, risk = (values[scored] for values in (hazards, one.score, one.risk))
+        labels, score, risk = hazards[scored], one.score[scored], one.risk[scored]
         by_site, decision = auroc_by_group(score, labels, sites[scored]), one.decision[rows]
         if not by_site:
             raise InvalidArgumentError("junctions: expected one with hazard and hazard-free windows")
