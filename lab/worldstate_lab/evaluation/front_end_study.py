@@ -1,6 +1,6 @@
 """Accuracy of the front-end and approach rate on the trials of a protocol (section IX of the paper)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,14 +64,17 @@ def front_end_study(trials: Sequence[Trial], rng: np.random.Generator, draws: in
 def _figures(trials: Sequence[Trial], rows: IndexArray) -> dict[str, float]:
     approaches = [trials[i].hops for i in rows.tolist() if not trials[i].hazard_free]
     calm = [trials[i].hops for i in rows.tolist() if trials[i].hazard_free]
-    checked = [_checked(hops) for hops in approaches]
-    seen = _pooled(approaches, lambda hops: hops.prominence[np.isfinite(hops.reference_rad)])
+    checked = [
+        HopTable({"prominence": hops.prominence, "error_rad": hops.srp_rad - hops.reference_rad})
+        for hops in approaches
+    ]
+    seen = [hops.prominence[np.isfinite(hops.reference_rad)] for hops in approaches]
     return {
-        "bearing_srp_deg": _median_deg(approaches, "srp_rad"),
-        "bearing_music_deg": _median_deg(approaches, "music_rad"),
+        "bearing_srp_deg": float(np.degrees(_median([_error(hops, "srp_rad") for hops in approaches]))),
+        "bearing_music_deg": float(np.degrees(_median([_error(hops, "music_rad") for hops in approaches]))),
         "bearing_gated_deg": gated_median_deg(joined(checked)) if checked else np.nan,
         "prominence_in_view": _median(seen),
-        "prominence_in_silence": _median(_pooled(calm, lambda hops: hops.prominence)),
+        "prominence_in_silence": _median([hops.prominence for hops in calm]),
         "doppler_usable": float(sum(hops.about["doppler"] == "" for hops in approaches)),
         **_looming(approaches, calm),
     }
@@ -79,55 +82,36 @@ def _figures(trials: Sequence[Trial], rows: IndexArray) -> dict[str, float]:
 
 def _looming(approaches: Sequence[HopTable], calm: Sequence[HopTable]) -> dict[str, float]:
     """Return how well the slope separates the last seconds before the pass from silence."""
-    passing = [hops for hops in approaches if hops.about["pass_s"] is not None]
-    left_s = [float(hops.about["pass_s"]) - hops.time_s for hops in passing]
-    imminent = [
-        hops.log_slope_hz[(left > 0.0) & (left < IMMINENT_S)]
-        for hops, left in zip(passing, left_s, strict=True)
-    ]
-    hidden = [hops.before_sight() & (hops.log_slope_hz > 2.0 / LONGEST_TTA_S) for hops in passing]
-    read = [2.0 / hops.log_slope_hz[use] for hops, use in zip(passing, hidden, strict=True)]
-    true = [left[use] for left, use in zip(left_s, hidden, strict=True)]
-    high, low = _known(_flat(imminent)), _known(_pooled(calm, lambda hops: hops.log_slope_hz))
+    imminent, read, true = [list[FloatArray]() for _ in range(3)]
+    for hops in (one for one in approaches if one.about["pass_s"] is not None):
+        left_s = float(hops.about["pass_s"]) - hops.time_s
+        imminent.append(hops.log_slope_hz[(left_s > 0.0) & (left_s < IMMINENT_S)])
+        hidden = hops.before_sight() & (hops.log_slope_hz > 2.0 / LONGEST_TTA_S)
+        read.append(2.0 / hops.log_slope_hz[hidden])
+        true.append(left_s[hidden])
+    high, low = _known(imminent), _known([hops.log_slope_hz for hops in calm])
     area = auroc(np.concatenate([high, low]), np.arange(high.size + low.size) < high.size)
     enough = sum(map(len, read)) > 2
-    return {
-        "looming_auroc": np.nan if area is None else area,
-        "looming_correlation": float(np.corrcoef(_flat(read), _flat(true))[0, 1]) if enough else np.nan,
-    }
+    agree = float(np.corrcoef(np.concatenate(read), np.concatenate(true))[0, 1]) if enough else np.nan
+    return {"looming_auroc": np.nan if area is None else area, "looming_correlation": agree}
 
 
 def _site_error(approaches: Sequence[HopTable], rng: np.random.Generator, draws: int) -> SiteError:
-    errors = [_known(_error(hops, "srp_rad")) for hops in approaches]
-    medians = [_median(one) for one in pooled_draws(errors, [0] * len(errors), rng, draws)]
-    every, interval = _flat(errors), middle(np.degrees(np.array(medians)))
-    return SiteError(float(np.degrees(_median(every))), interval, every.size)
-
-
-def _checked(hops: HopTable) -> HopTable:
-    """Return the bearings of one recording with the prominence of their windows."""
-    return HopTable({"prominence": hops.prominence, "error_rad": hops.srp_rad - hops.reference_rad})
+    errors = [_known([_error(hops, "srp_rad")]) for hops in approaches]
+    medians = [_median([one]) for one in pooled_draws(errors, [0] * len(errors), rng, draws)]
+    interval = middle(np.degrees(np.array(medians)))
+    return SiteError(float(np.degrees(_median(errors))), interval, sum(map(len, errors)))
 
 
 def _error(hops: HopTable, name: str) -> FloatArray:
     return np.asarray(np.abs(hops.columns[name] - hops.reference_rad))
 
 
-def _median_deg(approaches: Sequence[HopTable], name: str) -> float:
-    return float(np.degrees(_median(_known(_pooled(approaches, lambda hops: _error(hops, name))))))
+def _known(parts: Sequence[FloatArray]) -> FloatArray:
+    every: FloatArray = np.concatenate([np.empty(0), *parts])
+    return every[np.isfinite(every)]
 
 
-def _pooled(tables: Sequence[HopTable], of: Callable[[HopTable], FloatArray]) -> FloatArray:
-    return _flat([of(hops) for hops in tables])
-
-
-def _flat(parts: Sequence[FloatArray]) -> FloatArray:
-    return np.concatenate(parts) if parts else np.empty(0)
-
-
-def _known(values: FloatArray) -> FloatArray:
-    return values[np.isfinite(values)]
-
-
-def _median(values: FloatArray) -> float:
-    return float(np.median(values)) if values.size else np.nan
+def _median(parts: Sequence[FloatArray]) -> float:
+    known = _known(parts)
+    return float(np.median(known)) if known.size else np.nan

@@ -126,12 +126,13 @@ def _conditions(sweep: DetectorSweep, number: int) -> Table:
 
 
 def _condition(row: AwarenessRow) -> tuple[Cell, ...]:
+    known = [Value(math.nan if one is None else one) for one in (row.degradation, row.miss_rate)]
     before = row.unseen_awareness, row.detected, row.lead_time_s
     return (
         row.condition.name,
-        *(_known(one) for one in (row.degradation, row.miss_rate)),
+        *known,
         *(Value(*one) for one in (row.vision, row.awareness)),
-        *(_known(one) for one in before),
+        *(Value(math.nan if one is None else one) for one in before),
         *(Value(*one, digits=0) for one in (row.false_alarms_per_hour, row.false_awareness_per_hour)),
         Value(row.false_awareness),
     )
@@ -154,7 +155,3 @@ def _rain(sweep: DetectorSweep, number: int) -> Table:
 
 def _at(band: Band, place: tuple[int, ...]) -> Value:
     return Value(float(band.value[place]), float(band.low[place]), float(band.high[place]))
-
-
-def _known(value: float | None) -> Value:
-    return Value(math.nan if value is None else value)
