@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
@@ -21,7 +20,6 @@ from worldstate.abduction.signature.window_classes import CLASSES, hazard_statis
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
 from worldstate.adapters.files.model_file import Model
-from worldstate.ground.checks import finite_array, in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, TextArray
 from worldstate.operations.training.site_references import asked_while_listening, with_site_references
@@ -253,7 +251,7 @@ def transfer(
     )
 
 
-def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> FloatArray:
+def matched_risk(risk: FloatArray, table: FeatureTable, mean_risk: float) -> FloatArray:
     r"""Return the risks, shifted in log-odds for each junction, shape (n,).
 
     .. math:: r' = \sigma(\mathrm{logit}\, r + b), \qquad
@@ -265,18 +263,14 @@ def matched_risk(risk: ArrayLike, table: FeatureTable, mean_risk: float) -> Floa
 
     Shapes: risk (n,).
     """
-    values = finite_array("risk", risk, (len(table),))
-    mean = in_range("mean_risk", mean_risk, 0.0, 1.0, open_low=True, open_high=True)
-    if (values < 0).any() or (values > 1).any():
-        raise InvalidArgumentError("risk: expected numbers in [0, 1]")
-    log_odds = logit(np.clip(values, SMALLEST_RISK, 1.0 - SMALLEST_RISK))
+    log_odds = logit(np.clip(risk, SMALLEST_RISK, 1.0 - SMALLEST_RISK))
     keys, matched = table.recording_keys, np.empty(len(table))
     for key in np.unique(keys):
         mine = keys == key
         others = (table.environments == table.environments[mine][0]) & ~mine
         if not others.any():
             raise InvalidArgumentError(f"recording {key}: expected another recording of its junction")
-        matched[mine] = expit(log_odds[mine] + _shift(log_odds[others], mean))
+        matched[mine] = expit(log_odds[mine] + _shift(log_odds[others], mean_risk))
     return matched
 
 
