@@ -286,8 +286,7 @@ def test_another_model_of_a_moving_ego_processes_its_drives_again(tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("microphones", "rate_hz", "why"),
-    [(8, 48_000, "not the array of the model"), (56, 5_500, "got 5500 Hz")],
+    ("microphones", "rate_hz", "why"), [(8, 48_000, "not the array of the model"), (56, 5_500, "got 5500 Hz")]
 )
 def test_a_model_is_not_scored_on_sound_outside_its_domain(microphones, rate_hz, why, tmp_path):
     array = MicrophoneArray(ovad_array().positions_m[:microphones], "roof")

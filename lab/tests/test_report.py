@@ -16,11 +16,7 @@ from worldstate_lab.cli.main import keep_results, main, read_results, result_key
 from worldstate_lab.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
 from worldstate_lab.degradation.beta_curves import Band, BetaCurves
 from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, Condition
-from worldstate_lab.degradation.degradation_study import (
-    DegradationSettings,
-    DegradationStudy,
-    DetectorSweep,
-)
+from worldstate_lab.degradation.degradation_study import DegradationSettings, DegradationStudy, DetectorSweep
 from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate_lab.evaluation.figures import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.front_end_study import front_end_study

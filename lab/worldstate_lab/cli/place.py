@@ -59,10 +59,7 @@ HOP_S = 0.1
 # The simulated truth is the front bumper; real positions are the middle of the car.
 HALF_LENGTH_M = 2.0
 WALLS: Mapping[str, StreetWalls] = MappingProxyType(
-    {
-        "Site1": StreetWalls(4.45, 2.8, 2.8, 7.15, facing_m=9.9),
-        "Site2": StreetWalls(4.5, 2.78, 2.78, 6.5),
-    }
+    {"Site1": StreetWalls(4.45, 2.8, 2.8, 7.15, facing_m=9.9), "Site2": StreetWalls(4.5, 2.78, 2.78, 6.5)}
 )
 # Both lanes are 0.75 m beside the middle that the model uses.
 SIMULATED: Mapping[str, Site] = MappingProxyType(

@@ -36,11 +36,7 @@ from worldstate.ground.parallel import in_processes
 from worldstate.operations.metrics.approach_table import Figures
 from worldstate_lab.passes.budget_days import budget_days
 from worldstate_lab.passes.followed_stream import PassedStream, passed_stream
-from worldstate_lab.passes.pass_outcomes import (
-    onsets_by_traffic,
-    pass_figures,
-    second_figures,
-)
+from worldstate_lab.passes.pass_outcomes import onsets_by_traffic, pass_figures, second_figures
 from worldstate_lab.report.table import figure_lines
 
 

@@ -38,10 +38,7 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 
-from worldstate.abduction.cueing.risk_map import (
-    brier_score,
-    expected_calibration_error,
-)
+from worldstate.abduction.cueing.risk_map import brier_score, expected_calibration_error
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, read_ids
 from worldstate.adapters.files.model_file import read_model

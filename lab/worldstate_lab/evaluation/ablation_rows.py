@@ -6,11 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from worldstate.abduction.cueing.cueing_policy import sustained_alarm
-from worldstate.abduction.cueing.risk_map import (
-    brier_score,
-    expected_calibration_error,
-    fit_isotonic,
-)
+from worldstate.abduction.cueing.risk_map import brier_score, expected_calibration_error, fit_isotonic
 from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.operations.metrics.approach_table import (
@@ -111,10 +107,7 @@ def evaluate_ablation(
 
 
 def ablation_table(
-    streams: Sequence[HopTable],
-    reference_prior: Sequence[float],
-    seed: int,
-    base: AblationSwitches,
+    streams: Sequence[HopTable], reference_prior: Sequence[float], seed: int, base: AblationSwitches
 ) -> dict[str, dict[str, float | None]]:
     """Evaluate the full statistic, each part switched off, and looming added, on the same folds."""
     rows = {

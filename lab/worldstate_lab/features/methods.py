@@ -8,11 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.signature.ensemble import log_levels
-from worldstate.abduction.signature.ensemble_training import (
-    Recipe,
-    SimulatedWindows,
-    SiteEnsembleClassifier,
-)
+from worldstate.abduction.signature.ensemble_training import Recipe, SimulatedWindows, SiteEnsembleClassifier
 from worldstate.abduction.signature.window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT
 from worldstate.ground.typing import FloatArray
 from worldstate.operations.training.training import PUBLISHED_MISS_RATE, trained_ensemble

@@ -69,9 +69,7 @@ def labelled_windows(
 
 
 def best_weight(
-    streams: Sequence[HopTable],
-    weights: Sequence[float],
-    statistic: Callable[[HopTable, float], FloatArray],
+    streams: Sequence[HopTable], weights: Sequence[float], statistic: Callable[[HopTable, float], FloatArray]
 ) -> float:
     """Return the weight of looming with the largest window AUROC, the smallest among equals."""
     if len(weights) == 1:
