@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -80,25 +79,21 @@ def staging_of(detector: str, folder: Path, out: Path, seed: int = 0) -> Staging
 
 @cache
 def opened_nanodet(model: Path) -> Detector:
-    """Open NanoDet for reduced images, once per process: it has no state."""
-    example = nanodet_example()
+    """Open NanoDet for reduced images, once per process: it has no state.
+
+    The decoder is a plug-in among the examples that belongs to no package.
+    """
+    spec = importlib.util.spec_from_file_location("nanodet", _EXAMPLE)
+    if spec is None or spec.loader is None or not _EXAMPLE.is_file():
+        raise InputFileError(_EXAMPLE, "expected the example of a detector; it is part of the repository")
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
     crops = [
         (left / REDUCED, (top - _LEFT_OUT_ROWS) / REDUCED, side / REDUCED)
         for left, top, side in example.OVAD_CROPS
     ]
     opened: Detector = example.open_nanodet(model, crops)
     return opened
-
-
-@cache
-def nanodet_example() -> ModuleType:
-    """Import the decoder, a plug-in among the examples that belongs to no package."""
-    spec = importlib.util.spec_from_file_location("nanodet", _EXAMPLE)
-    if spec is None or spec.loader is None or not _EXAMPLE.is_file():
-        raise InputFileError(_EXAMPLE, "expected the example of a detector; it is part of the repository")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def stage_recording(staging: Staging, recording: CornerRecording) -> int:

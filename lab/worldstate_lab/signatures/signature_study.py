@@ -147,9 +147,7 @@ FIGURES = {"AUROC": area, "balanced accuracy": balanced_accuracy}
 BOTH_WAYS = ((IDMT, MELAUDIS), (MELAUDIS, IDMT))
 BYS: tuple[By, By] = ("level", "shape")
 VEHICLE = "vehicle"
-ELECTRIC = "electric"
-QUIET = (ELECTRIC, "bicycle", "tram")
-NOWHERE = "neither corpus labels electric cars"
+QUIET = ("bicycle", "tram")
 # Values of section IX of the paper, which gives one range for the shape without stating which end belongs to
 # which microphone.
 PAPER = {
@@ -265,7 +263,7 @@ def _row(
     known = [name if missing else tables[name].name for name in names]
     row = SignatureRow(question.name, " -> ".join(known), question.figure, None, paper=question.paper)
     if missing:
-        return replace(row, note=NOWHERE if question.kind == ELECTRIC else command(*names))
+        return replace(row, note=command(*names))
     if scored is None:
         return replace(row, note=TOO_FEW)
     (table, score, split), measure = scored, FIGURES[row.figure]

@@ -17,7 +17,7 @@ from worldstate.adapters.datasets.feature_extraction import (
     feature_table,
     sample_windows,
 )
-from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
+from worldstate.adapters.datasets.feature_table import FeatureTable, Group, read_features, write_features
 from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files.acoustic_domain import check_array, ovad_domain
 from worldstate.adapters.files.model_file import save_model
@@ -74,9 +74,16 @@ class Classifiers:
         self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial], seed: int
     ) -> tuple[list[Trial], list[Trial]]:
         """Return both parts of a fold with the posteriors of the classifiers for this fold."""
-        key = self._key(kind, calibration, tested, seed)
+        group: Group = "dynamic" if tested[0].hops.about["moving"] else "static"
+        left_out = sorted({junction_of(one.site) for one in tested}) if kind == "other junctions" else []
+        key: tuple[str, ...] = (kind, group, str(seed), *left_out)
+        if self.windows is None:
+            key = ("calibration", str(seed), *(one.name for one in calibration))
         if key not in self._trained:
-            table = self._table(kind, calibration, tested)
+            if self.windows is None:
+                table = windows_of(calibration)
+            else:
+                table = _other_windows(self.windows.group(group), tested, left_out)
             # The keys are names of evidence: the classifier of the paper, and the ensemble that this library
             # ships, both trained on the same windows.
             published = PublishedClassifier(np.random.default_rng(seed))
@@ -96,30 +103,13 @@ class Classifiers:
             self._heard[key, trial.name] = heard
         return self._heard[key, trial.name]
 
-    def _key(
-        self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial], seed: int
-    ) -> tuple[str, ...]:
-        if self.trained_on(kind) == "calibration":
-            return ("calibration", str(seed), *(trial.name for trial in calibration))
-        ego = "moving" if tested[0].hops.about["moving"] else "standing"
-        left_out = sorted({junction_of(trial.site) for trial in tested}) if kind == "other junctions" else []
-        return (kind, ego, str(seed), *left_out)
 
-    def _table(self, kind: TrainedOn, calibration: Sequence[Trial], tested: Sequence[Trial]) -> FeatureTable:
-        if self.windows is None:
-            return windows_of(calibration)
-        table = self.windows.group("dynamic" if tested[0].hops.about["moving"] else "static")
-        shared = {trial.name for trial in tested} & set(table.ids.tolist())
-        if shared:
-            raise InvalidArgumentError(
-                f"windows: expected none of a test recording, got those of {', '.join(sorted(shared)[:5])}"
-            )
-        if kind == "other junctions":
-            left_out = {junction_of(trial.site) for trial in tested}
-            table = table.select(
-                np.array([junction_of(place) not in left_out for place in table.environments.tolist()])
-            )
-        return table
+def _other_windows(table: FeatureTable, tested: Sequence[Trial], left_out: Sequence[str]) -> FeatureTable:
+    """Return the windows without those of some junctions; there may be none of a test recording."""
+    shared = ", ".join(sorted({one.name for one in tested} & set(table.ids.tolist()))[:5])
+    if shared:
+        raise InvalidArgumentError(f"windows: expected none of a test recording, got those of {shared}")
+    return table.select(np.array([junction_of(one) not in left_out for one in table.environments.tolist()]))
 
 
 def junction_of(site: str) -> str:
