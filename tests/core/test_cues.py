@@ -303,8 +303,9 @@ def test_a_relation_has_its_start_and_end() -> None:
     assert told[19]["occluded_by"] == (born, None)
     assert told[20]["occluded_by"] == told[69]["occluded_by"] == (born, 2 * 10**9)
     assert told[94] == {"emerged_from": (2 * 10**9, None)}
-    edges = world.predict(0.1).state.graph().edges(data=True)
-    assert [edge["since_ns"] for _, _, edge in edges] == [2 * 10**9]
+    graph = world.predict(0.1).state.graph()
+    assert [edge["since_ns"] for _, _, edge in graph.edges(data=True)] == [2 * 10**9]
+    assert set(dict(graph.nodes(data="type")).values()) == {"ego", "occluder", "entity"}
 
 
 @pytest.mark.parametrize("reads", [True, False])
