@@ -2,13 +2,14 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from street_measurements import after, run
 from watched_street import ALARM, START_NS, arrival, false_alarms
 
 from worldstate import Measurement, WorldFilter
@@ -117,20 +118,13 @@ def test_an_onset_is_false_without_a_vehicle_within_eight_seconds() -> None:
     assert told({100}, None, set(range(401))) == (0, 0.0)
 
 
-def budgets(measured: Iterator[Measurement] | list[Measurement]) -> list[Budget]:
-    world, told = WorldFilter(start_ns=START_NS), []
-    for one in measured:
-        world = world.update(one)
-        told.append(world.state.budget)
-    return told
+def budgets(measured: Iterable[Measurement]) -> list[Budget]:
+    return [world.state.budget for world in run(WorldFilter(start_ns=START_NS), measured)]
 
 
 def test_false_alarms_break_the_budget_and_keep_the_threshold() -> None:
-    world, told = WorldFilter(start_ns=START_NS), []
-    for one in false_alarms():
-        world = world.update(one)
-        told.append(world.state)
-    last = told[-1]
+    *_, world = worlds = run(WorldFilter(start_ns=START_NS), false_alarms())
+    *_, last = told = [one.state for one in worlds]
     verdicts = [state.budget.verdict for state in told]
     assert sorted(set(verdicts), key=verdicts.index) == ["kept", "in doubt", "broken"]
     assert last.budget.why == "more false onsets than the budget"
@@ -149,8 +143,8 @@ def test_the_requested_alpha_and_the_promise_are_published_with_a_budget() -> No
     for asked_alpha, stated in ((None, 0.02), (0.015, 0.02), (None, 0.0)):
         alarm = replace(ALARM, asked_alpha=asked_alpha, promise=promise)
         world = WorldFilter(policy=replace(uncalibrated_policy(), alpha=stated), start_ns=START_NS)
-        for one in false_alarms(hops=20):
-            world = world.update(replace(one, sequence=replace(one.sequence, alarm=alarm)))
+        alarms = (replace(one, sequence=replace(one.sequence, alarm=alarm)) for one in false_alarms(hops=20))
+        world = after(*alarms, world=world)
         budget = world.state.budget
         assert (budget.asked_alpha, budget.promise) == (asked_alpha, promise)
         assert {cue.alpha for cue in world.state.cues} == {promise.alpha if stated else None}
