@@ -208,7 +208,8 @@ def test_a_look_at_an_empty_sector_changes_nothing(context, ends) -> None:
 
 
 @pytest.mark.parametrize("sequence", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+# In the two last ones an entity behind a corner loses its cover: it keeps its side.
+@pytest.mark.parametrize("seed", [*range(4), 21, 540169])
 def test_a_mirrored_world_has_the_mirrored_state(sequence, seed) -> None:
     rng = np.random.default_rng(seed)
     told = [anything(rng, number + 1, sequence) for number in range(30)]

@@ -316,8 +316,11 @@ def _hide(tracks: Tracks, site: SiteGeometry) -> None:
     """Assign tracks behind a corner to the corner's side; those with a position are no longer in view."""
     rows = (tracks.detected & (tracks.behind >= HIDDEN)).nonzero()[0]
     if len(rows):
-        by = occluded(tracks, site)[rows].argmax(axis=1)
-        rows, by = rows[by < len(site.sides)], by[by < len(site.sides)]
+        chances = occluded(tracks, site)[rows]
+        by = chances.argmax(axis=1)
+        # If no occluder covers a track any more, it keeps its side.
+        covered = (by < len(site.sides)) & chances.any(axis=1)
+        rows, by = rows[covered], by[covered]
         tracks.side[rows], tracks.came_from[rows] = by, 1.0
         tracks.seen[rows] &= ~tracks.placed[rows]
 

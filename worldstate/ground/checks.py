@@ -91,6 +91,10 @@ def in_range(
     --------
     >>> in_range("alpha", 0.02, 0, 1, open_low=True)
     0.02
+    >>> in_range("std_rad", 0.0, ABOVE_ZERO, 3.2)
+    Traceback (most recent call last):
+        ...
+    worldstate...InvalidArgumentError: std_rad: expected a number in (0.0, 3.2], got 0.0
     """
     if type(value) is float and low < value < high:  # The usual case
         return value
@@ -103,8 +107,9 @@ def in_range(
     below = number <= low if open_low else number < low
     above = number >= high if open_high else number > high
     if below or above:
-        left, right = "(" if open_low else "[", ")" if open_high else "]"
-        raise InvalidArgumentError(f"{name}: expected a number in {left}{low}, {high}{right}, got {number}")
+        start = "(0.0" if low == ABOVE_ZERO else f"{'(' if open_low else '['}{low}"
+        end = "1.0)" if high == BELOW_ONE else f"{high}{')' if open_high else ']'}"
+        raise InvalidArgumentError(f"{name}: expected a number in {start}, {end}, got {number}")
     return number
 
 
