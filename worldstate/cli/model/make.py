@@ -87,6 +87,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     output.check_outputs(arguments, *(() if len(arrays) > 1 else ("out",)), "report", figures=("figure",))
     command.check_beside(arguments, exclude="labelled", source="labelled", figure="exam")
     settings, recorded = _settings(arguments), _recorded(arguments)
+    arguments.streams = arguments.streams or arguments.out.with_suffix(".streams")
     reports, lines = dict[str, dict[str, object]](), list[str]()
     for number, out in enumerate(outs):
         array, *beside = arrays[number:] or [frontend.ovad_array()]
@@ -138,7 +139,7 @@ def _made(
         model = commission.commission(
             array,
             settings,
-            _streams(arguments),
+            arguments.streams,
             table=_labelled(arguments),
             source=arguments.source or getattr(arguments.labelled, "name", ""),
             excluded_lists=[path.name for path in arguments.exclude],
@@ -164,7 +165,7 @@ def _examined(
     """Examine a model; return its report, and add its lines."""
     from worldstate.commissioning import commission, heard_stream, stream_exam
 
-    folder = _streams(arguments)
+    folder = arguments.streams
     report: dict[str, object] = {"out": str(out), "fit_for_use": model.provenance.fit_for_use}
     report["real_figures"] = [asdict(one) for one in model.provenance.real]
     lines += [one.sentence for one in model.provenance.real if one.sentence not in lines]
@@ -186,12 +187,6 @@ def _examined(
         report["mounting"] = mounted
         lines += ["", *stream_exam.mounting_lines(mounted)]
     return report
-
-
-def _streams(arguments: argparse.Namespace) -> Path:
-    """Return the folder of processed streams."""
-    folder: Path = arguments.streams or arguments.out.with_suffix(".streams")
-    return folder
 
 
 def _labelled(arguments: argparse.Namespace) -> "adapters.FeatureTable | None":
