@@ -27,7 +27,7 @@ from worldstate.ground.typing import Float32Array, FloatArray, IntArray
 from worldstate.measurement.odometry import Odometry
 
 from . import message_types as types
-from .message_types import instant_of, typestore
+from .message_types import instant_of, stamp_of, typestore
 from .sample_clock import begins_again, contradiction, lost_before
 
 # Commands that may repair a file of each storage.
@@ -529,9 +529,7 @@ def _timed(
     If more than three in four stamps repeat an earlier one, for example because a node always sends its start
     time, they are ignored. The time of recording then replaces them, as for messages without a stamp.
     """
-    told = [
-        (instant_of(one.header.stamp), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)
-    ]
+    told = [(stamp_of(one.header), recorded_ns, read(one)) for recorded_ns, one in _few(bag, topic, most)]
     stamped = [stamp_ns for stamp_ns, *_ in told if stamp_ns]
     if stands := 4 * len({*stamped}) < len(stamped):  # transports hardly ever repeat a message so often
         _LOG.warning("%s: stamps of %s do not advance, so the times of recording are used", bag.path, topic)

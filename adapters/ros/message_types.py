@@ -71,6 +71,11 @@ def time_of(stamp_ns: int) -> dict[str, int]:
     return {"sec": sec, "nanosec": nanosec}
 
 
+def stamp_of(header: Any) -> int:
+    """Return the stamp of a message header, ns."""
+    return instant_of(header.stamp)
+
+
 def instant_of(time: Any) -> int:
     """Return a ROS time in ns."""
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)
