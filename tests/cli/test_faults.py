@@ -217,7 +217,7 @@ READERS = {
     "array.xml": "array bounds --array {}",
     "array.csv": "array bounds --array {}",
     "array.json": "array bounds --array {}",
-    "model.json": "model {}",
+    "model.json": "model show {}",
     "streams.npz": "model threshold {} --out {new}",
     "table.csv": "model fit {} --out {new}",
     "ids.csv": "model fit {whole}/table.csv --exclude {} --out {new}",
