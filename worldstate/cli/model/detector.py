@@ -22,15 +22,15 @@ import argparse
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from worldstate import adapters, operations
 from worldstate.adapters import own_parts
 from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
-
-if TYPE_CHECKING:
-    from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, MakeDetector
+from worldstate.ground.version import __version__
+from worldstate.operations.detectors import miss_rate_measurement as measurement
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -48,13 +48,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
-    import numpy as np
-
-    from worldstate.operations.detectors.miss_rate_measurement import find_videos, write_absence_figure
-
     output.check_outputs(arguments, "out", figures=("figure",))
     make = own_parts.detector_maker(arguments.detector, tuple(arguments.labels))
-    videos = find_videos(arguments.input)
+    videos = measurement.find_videos(arguments.input)
     if arguments.reference is not None and len(videos) > 1:
         raise InvalidArgumentError(f"--reference: expected one video with it, got {len(videos)}")
     scenes = [_scene(arguments, make, *one) for one in videos]
@@ -63,29 +59,25 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         rates = operations.measure_absence(scenes, make, rng, provenance=about, on_frame=bar.advance)
     adapters.save_miss_rates(arguments.out, rates)
     if arguments.figure is not None:
-        write_absence_figure(rates, arguments.figure)
+        measurement.write_absence_figure(rates, arguments.figure)
     return output.CommandResult(_summary(arguments, rates))
 
 
 def _scene(
-    arguments: argparse.Namespace, make: "MakeDetector", path: Path, reference: Path | None
-) -> "LabelledVideo":
-    from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, reference_by
-
+    arguments: argparse.Namespace, make: measurement.MakeDetector, path: Path, reference: Path | None
+) -> measurement.LabelledVideo:
     video = adapters.open_video(path)
     camera = adapters.PinholeCamera.ovad(width_px=video.width_px, height_px=video.height_px)
     if arguments.half_angle is not None:
         camera = replace(camera, half_angle_rad=math.radians(arguments.half_angle))
     boxes = arguments.reference or reference
     if boxes is None:
-        return LabelledVideo(video, reference_by(make(), video), camera)
-    size = (video.width_px, video.height_px)
-    return LabelledVideo(video, adapters.read_any_detections(boxes, video.frame_rate_hz, size), camera)
+        return measurement.LabelledVideo(video, measurement.reference_by(make(), video), camera)
+    found = adapters.read_any_detections(boxes, video.frame_rate_hz, (video.width_px, video.height_px))
+    return measurement.LabelledVideo(video, found, camera)
 
 
 def _provenance(arguments: argparse.Namespace, videos: int) -> dict[str, str]:
-    from worldstate.ground.version import __version__
-
     return {
         "data": arguments.input.name,
         "videos": str(videos),

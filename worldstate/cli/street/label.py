@@ -25,6 +25,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from worldstate import adapters
 from worldstate.cli.common import inputs, output, progress
 from worldstate.ground.errors import InvalidArgumentError
@@ -48,8 +50,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
-    import numpy as np
-
     from worldstate.adapters.audio.sound_file import SoundStream
     from worldstate.adapters.datasets.ovad import read_true_tracks
     from worldstate.adapters.files.file_io import write_json, write_rows
@@ -104,8 +104,6 @@ def _windows(
     passes: Sequence["PassLabel"],
     file: str,
 ) -> list[tuple[object, ...]]:
-    import numpy as np
-
     from worldstate.adapters.audio.sound_file import open_sound
     from worldstate.operations.labelling.label_files import labelled_windows
 
