@@ -112,6 +112,7 @@ def files(tmp_path, monkeypatch) -> Path:
         ("model make --array xmos --array xmos --out m2", "--array: expected each name once"),
         ("model make --exclude ids.csv --out m2.json", "--exclude: expected --labelled with it"),
         ("model make --source mine --out m2.json", "--source: expected --labelled with it"),
+        ("model fit t.csv --sample-rate 16000 --out m2.json", "--sample-rate: expected --array with it"),
         ("sim make --out new --site SB1", "--site: expected --minutes with it"),
         ("sim make --out new --traffic busy", "--traffic: expected --minutes with it"),
         ("sim make --out new --video-width 320", "--video-width: expected --video with it"),

@@ -2,7 +2,8 @@
 
 Train a signature classifier on labelled feature windows, and set its thresholds gamma(alpha) and risk maps on
 out-of-fold scores. The model file is JSON with the coefficients and the origin of the windows: array, sample
-rate, band and ego motion. It holds no row of the data. A table without these is taken as OVAD's.
+rate, band and ego motion. It holds no row of the data. A table without these is taken as OVAD's, unless
+--array and --sample-rate state others.
 
 The classifier is a mirror-symmetric ensemble on windows relative to their site, for unseen junctions. Its
 thresholds are half-way between those for left-out recordings and those for left-out junctions. --simulated
@@ -38,6 +39,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--labels", type=Path, nargs="+", default=[], metavar="CSV", help=labels)
     ids = "CSV files with a column ID: recordings to leave out"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
+    add("--array", type=Path, metavar="FILE", help="array of the windows")
+    add("--sample-rate", type=float, metavar="HZ", help="sample rate of the windows (default: 47998)")
     add("--source", metavar="TEXT", help="name of the data set (default: name of the file)")
     add("--seed", type=int, default=0, help="seed of the folds (default: %(default)s)")
 
@@ -62,6 +65,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
     from worldstate.adapters.datasets.feature_table import read_ids
 
     output.check_outputs(arguments, "out")
+    command.check_beside(arguments, sample_rate="array")
     table = _with_domain(arguments, adapters.read_features(arguments.table)).group(arguments.group)
     labelled = [_heard_windows(path, table) for path in arguments.labels]
     for one in labelled:
@@ -127,10 +131,17 @@ def _heard_windows(labels: Path, table: "adapters.FeatureTable") -> "adapters.Fe
 
 
 def _with_domain(arguments: argparse.Namespace, table: "adapters.FeatureTable") -> "adapters.FeatureTable":
-    """Return the table with its domain, or OVAD's."""
-    from worldstate.adapters.files.acoustic_domain import ovad_domain
+    """Return the table with its domain: its own, that of the options, or OVAD's."""
+    from worldstate.adapters.files.acoustic_domain import check_array, domain_of, ovad_domain
+    from worldstate.frontend.direction.feature import FEATURE_RATE_HZ
 
+    environments = table.environments.tolist()
+    array = None if arguments.array is None else adapters.read_array(arguments.array)
     if table.domain is not None:
+        if array is not None:
+            check_array(table.domain, array)
         return table
-    output.say(f"{arguments.table} states no array: taken as OVAD's")
-    return replace(table, domain=ovad_domain(table.environments.tolist()))
+    if array is None:
+        output.say(f"{arguments.table} states no array: taken as OVAD's")
+        return replace(table, domain=ovad_domain(environments))
+    return replace(table, domain=domain_of(array, [arguments.sample_rate or FEATURE_RATE_HZ], environments))

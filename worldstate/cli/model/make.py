@@ -58,6 +58,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     ids = "CSV files with a column ID: recordings to leave out of the labelled windows"
     add("--exclude", type=Path, nargs="+", action="extend", default=[], metavar="IDS", help=ids)
     add("--source", metavar="TEXT", help="name of the labelled windows (default: name of the file)")
+    licence = "licence of the labelled windows, for the card (default: %(default)s)"
+    add("--licence", default="none stated", metavar="TEXT", help=licence)
     quiet = "recordings without a vehicle, to set the alarm"
     add("--quiet", type=Path, nargs="+", default=[], metavar="SOUND", help=quiet)
     add("--sounds", type=Path, metavar="FOLDER", help="folder of your own clips")
@@ -142,6 +144,7 @@ def _made(
             arguments.streams,
             table=_labelled(arguments),
             source=arguments.source or getattr(arguments.labelled, "name", ""),
+            licence=arguments.licence,
             excluded_lists=[path.name for path in arguments.exclude],
             quiet=arguments.quiet,
             recorded=recorded,
