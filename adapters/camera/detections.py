@@ -45,7 +45,7 @@ _NO_LABELS = frozenset({"classes.txt", "README.txt", "README.dataset.txt", "READ
 # Other names for the time of an image.
 _TIMES = {f"{name}{unit}" for name in ("stamp", "timestamp", "time") for unit in ("", "_s", "_ms", "_us")}
 _PER_FRAME = re.compile(r'"detections_per_frame"\s*:\s*\[')
-_FORMS = "`worldstate run --help-all` lists the forms that detections may have"
+_FORMS = "`worldstate run --help` lists the forms that detections may have"
 # Car and bus if categories start at 0 as in YOLO, bicycle and airplane if they start at 1 as in COCO.
 _UNSURE = frozenset({"2", "5"})
 # Fewer numbers than these may have a common step by chance.
