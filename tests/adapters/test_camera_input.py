@@ -90,7 +90,7 @@ def test_a_detector_searches_the_video_of_a_folder(watched):
         # A square without texture moves at its edges: its front is found, its middle is still.
         np.testing.assert_allclose(box[1:], [150, 25 * number + 120, 300], atol=12)
         assert 25 * number - 12 <= box[0] < box[2]
-    assert len(list(listen(watched, detector=MotionDetector()))) == 11
+    assert len(list(listen(watched, detector="motion"))) == 11
 
 
 def test_a_detector_needs_a_folder_with_a_video_and_no_detections(watched):
@@ -99,8 +99,11 @@ def test_a_detector_needs_a_folder_with_a_video_and_no_detections(watched):
         open_source(watched / "out_multi.wav", detector=MotionDetector())
     with pytest.raises(InvalidArgumentError, match="no detections"):
         open_source(watched, detector=MotionDetector(), detections=nothing)
+    (watched / VIDEO_NAME).write_text("no video")
+    with pytest.raises(InputFileError, match=f"{VIDEO_NAME}.* cannot be opened"):
+        open_source(watched, detector="knn")
     (watched / VIDEO_NAME).unlink()
-    with pytest.raises(InputFileError, match=VIDEO_NAME):
+    with pytest.raises(InputFileError, match=f"{VIDEO_NAME}.* does not exist"):
         open_source(watched, detector=MotionDetector())
 
 
