@@ -364,6 +364,8 @@ class FrontEnd:
         spectrum, azimuths = doa.about_the_peak(self._srp(heard), self._azimuths)
         peaks, floor = doa.find_peaks(spectrum, azimuths), self._least_prominence
         bearing = self._scatter.widened(doa.bearing_of(spectrum, peaks, azimuths, floor))
+        weights = np.maximum(hops["n_frames"][heard], 1)
+        centre = float(weights @ hops["centre"][heard] / np.add.reduce(weights))
         shares = hops["share"].tolist()
         window = sum(shares) / WINDOW_HOPS
         return AcousticFrame(
@@ -379,7 +381,7 @@ class FrontEnd:
             band_log_energy=levels,
             looming=self._looming(hop.end),
             feature=self._feature(),
-            bearing_age_s=self._age_s(heard, hop.end),
+            bearing_age_s=(hop.end - centre) / self.heard_rate_hz,
             health=self._health,
             tone=TONE_IS_OFF if self._tone is None else self._tone.read(),
             character=CHARACTER_IS_OFF if self._character is None else self._character.read(),
@@ -406,11 +408,6 @@ class FrontEnd:
         n_bins, n_microphones = len(self._spectra.srp_bins), self.array.n_microphones
         power = doa.normalised(total, max(n_frames, 1), n_bins, n_microphones)
         return np.asarray(np.maximum.reduce(power.reshape(-1, len(self._azimuths))))
-
-    def _age_s(self, hops: IndexArray, end: int) -> float:
-        weights = np.maximum(self._window["n_frames"][hops], 1)
-        centre = float(weights @ self._window["centre"][hops] / np.add.reduce(weights))
-        return (end - centre) / self.heard_rate_hz
 
     def _feature(self) -> FloatArray:
         half = WINDOW_HOPS // FEATURE_SEGMENTS

@@ -287,15 +287,12 @@ def track_fundamental(samples: ArrayLike, sample_rate_hz: float) -> HarmonicTrac
     time = np.asarray((starts + 0.5 * (size - 1)) / rate, dtype=np.float64)
     windows = Windows(time, frames, shape, floor, rate)
     for _ in range(PASSES):
-        found = measure_fundamental(windows, fundamental, _slope(time, fundamental))
+        slope = np.zeros_like(fundamental)
+        if len(time) >= 5:  # Straight lines through five windows
+            step_s = float(np.diff(time).mean())
+            slope = scipy.signal.savgol_filter(fundamental, 5, 1, deriv=1, delta=step_s)
+        found = measure_fundamental(windows, fundamental, slope)
         fundamental = np.where(found.n_partials > 0, found.frequency_hz, fundamental)
     usable = found.n_partials > 0
     columns = (one.name for one in fields(found) if one.name != "windows")
     return replace(found, **{name: getattr(found, name)[usable] for name in columns})
-
-
-def _slope(time: FloatArray, frequency: FloatArray) -> FloatArray:
-    """Return the slope of the track, Hz per second, from straight lines through five windows."""
-    if len(time) < 5:
-        return np.zeros_like(frequency)
-    return np.asarray(scipy.signal.savgol_filter(frequency, 5, 1, deriv=1, delta=float(np.diff(time).mean())))

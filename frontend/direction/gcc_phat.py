@@ -130,18 +130,12 @@ def _peaks(cross: ComplexArray, frequencies: FloatArray, limit: float) -> tuple[
     coarse = lags[np.argmax(correlation, axis=1)]
     delay = np.clip(coarse, -limit, limit)
     for _ in range(NEWTON_STEPS):
-        delay = _newton_step(cross, omega, delay)
+        steered = cross * np.exp(1j * delay[:, None] * omega)
+        slope, curvature = -(steered.imag @ omega), -(steered.real @ omega**2)
+        # Outside the concave part of the peak, a Newton step would lead away from it.
+        delay = delay - np.divide(slope, curvature, out=np.zeros_like(delay), where=curvature < 0)
         delay = np.clip(delay, coarse - step, coarse + step)
         delay = np.clip(delay, -limit, limit)
     reachable = np.abs(cross).sum(axis=1)
     height = (cross * np.exp(1j * delay[:, None] * omega)).real.sum(axis=1)
     return delay, np.divide(height, reachable, out=np.zeros_like(delay), where=reachable > 0)
-
-
-def _newton_step(cross: ComplexArray, omega: FloatArray, delay: FloatArray) -> FloatArray:
-    steered = cross * np.exp(1j * delay[:, None] * omega)
-    slope = -(steered.imag @ omega)
-    curvature = -(steered.real @ omega**2)
-    # Outside the concave part of the peak, a Newton step would lead away from it.
-    step = np.divide(slope, curvature, out=np.zeros_like(delay), where=curvature < 0)
-    return np.asarray(delay - step)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from worldstate.frontend.array.microphone_array import ChannelMask
 from worldstate.ground import BoolArray, FloatArray, NotUsable, mean
-from worldstate.ground.typing import Float32Array, IndexArray
+from worldstate.ground.typing import Float32Array
 
 # Number of examined channels, evenly spaced: a dropout is at the same sample in all channels.
 _PICKED = 8
@@ -117,7 +117,12 @@ class StillRuns:
         # The last run may continue in the next hop.
         edges = np.concatenate([[-1 - self._length], moving, [len(still)]])
         lengths = edges[1:] - edges[:-1] - 1
-        long = (lengths >= self._shortest(lengths[:-1])).nonzero()[0]
+        # The shortest run that is unlikely for the share of constant samples so far.
+        self._n_still += int(lengths[:-1][lengths[:-1] < _SHORTEST_STILL].sum())
+        self._n_moving += len(moving)
+        share = self._n_still / max(self._n_still + self._n_moving, 1)
+        unlikely = np.log(_STILL_CHANCE) / np.log(share) if share else 0.0
+        long = (lengths >= max(_SHORTEST_STILL, unlikely)).nonzero()[0]
         self.runs = [(int(first + edges[i]), int(first + edges[i] + lengths[i] + 1)) for i in long]
         self._length = int(lengths[-1])
         over = ((begin, stop) for begin, stop in self.runs if stop < end or not self._length)
@@ -126,13 +131,6 @@ class StillRuns:
             ended = [one for one in ended if one.sample > 0 and one.sample >= first + moving[0]]
         self._has_changed |= bool(len(moving))
         return ended
-
-    def _shortest(self, lengths: IndexArray) -> float:
-        """Return the shortest run that is unlikely for the share of constant samples so far."""
-        self._n_still += int(lengths[lengths < _SHORTEST_STILL].sum())
-        self._n_moving += len(lengths)
-        share = self._n_still / max(self._n_still + self._n_moving, 1)
-        return max(_SHORTEST_STILL, np.log(_STILL_CHANCE) / np.log(share)) if share else _SHORTEST_STILL
 
 
 def find_splices(change: Float32Array, start: int, still: BoolArray) -> list[Dropout]:
