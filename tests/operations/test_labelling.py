@@ -19,7 +19,7 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, write_featu
 from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.labelling.label_files import file_below, labelled_windows, open_label
+from worldstate.operations.labelling.label_files import file_below, open_label, pass_windows
 from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks, label_passes
 from worldstate.operations.labelling.street_figure import draw_passes
 
@@ -111,7 +111,7 @@ def test_overtaking_vehicles_have_no_arm():
 def test_no_vehicle_appears_soon_after_an_empty_window():
     time_s = np.arange(10, 600) / 10.0
     seen = (time_s >= 24.0) & (time_s <= 27.0)
-    ends = [row[5] for row in labelled_windows([], seen, time_s, "Sown", "street.wav")]
+    ends = [row[5] for row in pass_windows([], seen, time_s, "Sown", "street.wav")]
     assert ends
     assert all(end_s + 5.0 < 24.0 or end_s - 3.0 > 26.9 for end_s in ends)
 
@@ -130,7 +130,7 @@ def test_windows_exclude_two_vehicles_and_busy_seconds(labelled):
     starts, tracks, passes = labelled
     time_s = np.arange(10, 420) / 10.0
     seen = np.any([(time_s >= one.time_s[0]) & (time_s <= one.time_s[-1]) for one in tracks], axis=0)
-    rows = labelled_windows(passes, seen, time_s, "Sown", "street.wav")
+    rows = pass_windows(passes, seen, time_s, "Sown", "street.wav")
     classes = "left", "right", "front", "none"
     by_class = {label: [row[5] for row in rows if row[1] == label] for label in classes}
     # The first two are half a second apart, so neither gives a clean window.

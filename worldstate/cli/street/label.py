@@ -105,7 +105,7 @@ def _windows(
     file: str,
 ) -> list[tuple[object, ...]]:
     from worldstate.adapters.audio.sound_file import open_sound
-    from worldstate.operations.labelling.label_files import labelled_windows
+    from worldstate.operations.labelling.label_files import pass_windows
 
     with open_sound(source.sound, channels=source.array.channels) as audio:
         time_s = np.arange(10, int(10.0 * audio.duration_s) + 1) / 10.0
@@ -113,4 +113,4 @@ def _windows(
     for one in tracks:
         seen |= (time_s >= one.time_s[0] - 0.05) & (time_s <= one.time_s[-1] + 0.05)
     environment = arguments.environment or f"S{source.audio_path.parent.name}"
-    return labelled_windows(passes, seen, time_s, environment, file)
+    return pass_windows(passes, seen, time_s, environment, file)

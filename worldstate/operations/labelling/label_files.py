@@ -98,10 +98,10 @@ def corpus_windows(corpus: Path) -> Iterator[tuple[object, ...]]:
                 passes.append(SeenPass(row.side, FirstSight(first_s, HANDED_OVER_STD_S)))
         file = one.recording if Path(one.recording).suffix else f"{one.recording}/{AUDIO_NAME}"
         site = one.site if ENVIRONMENT.fullmatch(one.site) else f"S{one.site}"
-        yield from labelled_windows(passes, in_view, time_s, site, file)
+        yield from pass_windows(passes, in_view, time_s, site, file)
 
 
-def labelled_windows(
+def pass_windows(
     passes: Sequence[SeenPass | PassLabel],
     in_view: BoolArray,
     time_s: FloatArray,
