@@ -319,9 +319,10 @@ def _table(verdicts: tuple[ChannelVerdict, ...]) -> Iterator[str]:
     yield f"{'channel':>7}  {'fault':<12}  {'since':>6}  {'hops':>5}  what and what to do"
     for _, card in itertools.groupby(enumerate(verdicts), _card):
         each = [verdict for _, verdict in card]
-        channels = "-".join(str(one.channel + 1) for one in (each[0], *each[1:][-1:]))
-        when = f"{each[0].first_s:5.1f}s  {100 * each[0].share:4.0f}%"
-        yield f"{channels:>7}  {each[0].fault.value:<12}  {when}  {_advice(each[0])}"
+        first, last = each[0], each[-1].channel + 1
+        channels = str(last) if len(each) == 1 else f"{first.channel + 1}-{last}"
+        when = f"{first.first_s:5.1f}s  {100 * first.share:4.0f}%"
+        yield f"{channels:>7}  {first.fault.value:<12}  {when}  {_advice(first)}"
 
 
 def _card(numbered: tuple[int, ChannelVerdict]) -> object:
