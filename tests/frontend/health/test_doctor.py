@@ -73,7 +73,7 @@ def test_array_check_prints_a_remedy_per_fault(street, tmp_path, capsys):
 @pytest.mark.long
 @pytest.mark.parametrize("fault", Fault)
 def test_a_microphone_with_any_fault_is_drawn(fault: Fault, tmp_path: Path) -> None:
-    health = RecordingHealth((ChannelVerdict(3, fault, 1.0, 1.0, 1.0),), (), 0, 1, 0.5)
+    health = RecordingHealth((ChannelVerdict(3, fault, 1.0, 1.0, 1.0),), (), 0, 0.5)
     write_array_figure(roof_array_56(), health, tmp_path / "array.svg")
     assert f"<!-- {fault.value} -->" in (tmp_path / "array.svg").read_text()
 

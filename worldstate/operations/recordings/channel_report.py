@@ -136,7 +136,6 @@ class RecordingHealth:
     verdicts: tuple[ChannelVerdict, ...]  # Faults by channel; empty without a fault
     dropouts: tuple[Dropout, ...]  # The first hundred
     n_dropouts: int  # All of them
-    n_hops: int  # Hops processed
     coherence: float | NotUsable  # At the end: see `worldstate.frontend.health.channel_health.ArrayHealth`
     sample_rate: RateEstimate | None = None  # Sample rate measured with another clock
     positions: PositionVerdict = NOTHING_AGAINST
@@ -207,7 +206,7 @@ class HealthLog:
         dropouts, count = tuple(self._dropouts[:_LISTED_DROPOUTS]), latest.n_dropouts if latest else 0
         coherence = latest.coherence if latest else NotUsable("nothing heard")
         unheard = next((why for why in ARRAY_FAULTS if 2 * self._unheard[why] > self._n_hops), None)
-        return RecordingHealth(self._verdicts(), dropouts, count, self._n_hops, coherence, unheard=unheard)
+        return RecordingHealth(self._verdicts(), dropouts, count, coherence, unheard=unheard)
 
     def _verdicts(self) -> tuple[ChannelVerdict, ...]:
         explained = {(channel, other) for channel, fault in self._seen for other in _EXPLAINS.get(fault, ())}
