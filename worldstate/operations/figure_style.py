@@ -77,6 +77,7 @@ def figure_style() -> Iterator[None]:
 def figure_file(path: Path, width_in: float, height_in: float) -> Iterator["Figure"]:
     """Yield an empty figure, which is written atomically if the block ends without an error."""
     check_suffix(path)
+    check_extra("matplotlib")
     from matplotlib.figure import Figure
 
     with figure_style():
