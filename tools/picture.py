@@ -156,8 +156,7 @@ def chart(axes: Axes, state: WorldState, shown: list[WorldState], track: TrueTra
     axes.set_yticklabels(("0", "50 %", "100 %"))
     axes.tick_params(colors=MUTED, labelsize=9.5, length=0)
     axes.set_xlabel("time (s)", color=MUTED, size=9.5, labelpad=1)
-    for side in axes.spines.values():
-        side.set_visible(False)
+    axes.spines[:].set_visible(False)
     axes.grid(axis="y", color=HOUSE, lw=0.7)
     past = [one for one in shown if one.stamp_ns <= state.stamp_ns]
     time_s = [one.time_s for one in past]
@@ -188,8 +187,7 @@ def risk_of(state: WorldState, side: str | None) -> float:
 def hide(axes: Axes) -> None:
     """Take ticks and frame away."""
     axes.set(xticks=(), yticks=())
-    for side in axes.spines.values():
-        side.set_visible(False)
+    axes.spines[:].set_visible(False)
 
 
 if __name__ == "__main__":
