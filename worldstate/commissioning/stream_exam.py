@@ -274,11 +274,9 @@ def auroc_before(streams: Sequence[ExaminedStream], before_s: FloatArray) -> Flo
     none = np.concatenate(quiet)
     areas = []
     for before in before_s:
-        scores = np.concatenate([_scores_at(one, before) for one in streams])
-        labels = np.concatenate([np.ones(scores.size, bool), np.zeros(none.size, bool)])
-        area = auroc(np.concatenate([scores, none]), labels)
-        areas.append(np.nan if area is None else area)
-    return np.array(areas)
+        scores = np.concatenate([*(_scores_at(one, before) for one in streams), none])
+        areas.append(auroc(scores, np.arange(scores.size) < scores.size - none.size))
+    return np.array(areas, np.float64)  # Without an approach the area is NaN
 
 
 def _scores_at(stream: ExaminedStream, before_s: float) -> FloatArray:
