@@ -164,7 +164,8 @@ def write_stream(
 
     Examples
     --------
-    >>>     >>> from worldstate.simulation import site
+    >>> from tempfile import TemporaryDirectory
+    >>> from worldstate.simulation import site
     >>> pair = MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
     >>> settings = StreamSettings(site("SB1"), minutes=0.1, sample_rate_hz=6000.0)
     >>> with TemporaryDirectory() as root:

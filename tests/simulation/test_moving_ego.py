@@ -52,7 +52,7 @@ from worldstate.simulation.sound.renderers import ADD_SOURCE
 from worldstate.simulation.sound.scatter import add_scattered
 from worldstate.simulation.stream.arrivals import STANDING, VehicleEvent
 from worldstate.simulation.stream.manoeuvres import Driver, emerges
-from worldstate.simulation.stream.rendering import draw_microphones, event_sound, loudness_db
+from worldstate.simulation.stream.rendering import EventSound, draw_microphones, event_sound, loudness_db
 from worldstate.simulation.stream.settings import StreamSettings, traffic_named
 from worldstate.simulation.stream.writing import draw_stream
 
@@ -290,14 +290,16 @@ def test_every_drive_has_one_approach_in_view_before_the_stop(seed: int) -> None
             assert (passes and pictured) == clear
 
 
+def passed(name: str, reach_m: float, start_s: float, ego: EgoMotion, within_s=(0.0, 8.0)) -> EventSound:
+    """Return the sound of a vehicle out of the left arm."""
+    driver = Driver(drawn_site(name), LIGHT, "left", 6.0, 0.0, reach_m)
+    event = VehicleEvent("left", emerges(driver, np.random.default_rng(0)), start_s)
+    microphones, rng = draw_microphones(drive(1), PAIR, np.random.default_rng(3)), np.random.default_rng(2)
+    return event_sound(event, driver.site, preset(), microphones, rng, ego, within_s)
+
+
 def test_after_the_stop_the_sound_is_that_of_a_standing_ego() -> None:
-    place = drawn_site("DB101")
-    event = VehicleEvent("left", emerges(Driver(place, LIGHT, "left", 6.0, 0.0, 40.0), None), -4.0)  # type: ignore[arg-type]
-    microphones = draw_microphones(drive(1), PAIR, np.random.default_rng(3))
-    moving, standing = (
-        event_sound(event, place, preset(), microphones, np.random.default_rng(2), ego, (0.0, 8.0))
-        for ego in (EgoMotion(8.0, 4.0), STANDING)
-    )
+    moving, standing = (passed("DB101", 40.0, -4.0, ego) for ego in (EgoMotion(8.0, 4.0), STANDING))
     assert moving.first == standing.first == 0
     after = slice(round(4.5 * RATE_HZ), round(8.0 * RATE_HZ))
     error = (moving.pressure_pa - standing.pressure_pa)[:, after]
@@ -308,17 +310,11 @@ def test_after_the_stop_the_sound_is_that_of_a_standing_ego() -> None:
 
 
 def test_sources_removed_from_a_drive_are_inaudible() -> None:
-    place, ego = drawn_site("DB102"), EgoMotion(5.0, 5.0)
-    event = VehicleEvent("left", emerges(Driver(place, LIGHT, "left", 6.0, 0.0, 60.0), None), -5.0)  # type: ignore[arg-type]
-    microphones = draw_microphones(drive(1), PAIR, np.random.default_rng(3))
-    rows = np.arange(1.0, 7.0, 0.1)
     levels = [
         loudness_db(
-            event_sound(event, place, preset(), microphones, np.random.default_rng(2), ego, within),
-            rows,
-            RATE_HZ,
+            passed("DB102", 60.0, -5.0, EgoMotion(5.0, 5.0), within_s), np.arange(1.0, 7.0, 0.1), RATE_HZ
         )
-        for within in ((-np.inf, np.inf), (0.0, 8.0))
+        for within_s in ((-np.inf, np.inf), (0.0, 8.0))
     ]
     # Noise is drawn again, the vehicle is the same.
     assert np.abs(np.subtract(*levels)).mean() < 1.5

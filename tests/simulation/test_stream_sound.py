@@ -57,6 +57,11 @@ def event_at(start_s: float, flow: str = "left", reach_m: float = 20.0) -> Vehic
     return VehicleEvent(flow, MANOEUVRES[flow](driver, np.random.default_rng(1)), start_s)
 
 
+def alone_in(scene: StreamScene, event: Event) -> EventSound:
+    rng = np.random.default_rng(2)
+    return event_sound(event, site("SB1"), scene.settings.preset, scene.microphones, rng)
+
+
 def sound_of(scene: StreamScene, events: Sequence[Event]) -> Float32Array:
     return np.concatenate([block.pressure_pa for block in render_blocks(scene, events)], axis=1)
 
@@ -121,10 +126,7 @@ def test_rain_of_a_stream_is_continuous_and_incoherent() -> None:
 
 def test_events_rise_to_line_of_sight_from_silence_to_silence() -> None:
     scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=42.0)
-    alone = event_sound(
-        event, site("SB1"), scene.settings.preset, scene.microphones, np.random.default_rng(2)
-    )
-    rows = row_times(event, scene.settings)
+    alone, rows = alone_in(scene, event), row_times(event, scene.settings)
     levels, t0_s = loudness_db(alone, rows, 3000.0), visible_s(event, site("SB1"))
     assert t0_s is not None
     seconds = [levels[(rows > t0_s - i - 1) & (rows <= t0_s - i)].mean() for i in range(5)]
@@ -168,12 +170,7 @@ def test_a_second_vehicle_adds_its_power(later_s: float) -> None:
 
 def test_a_signal_is_added_to_the_unchanged_vehicle() -> None:
     scene, event = scene_of(0.5, rate_hz=3000.0), event_at(2.0, reach_m=20.0)
-    plain, warning = (
-        event_sound(
-            one, site("SB1"), scene.settings.preset, scene.microphones, np.random.default_rng(2)
-        ).pressure_pa
-        for one in (event, replace(event, signal="siren"))
-    )
+    plain, warning = (alone_in(scene, one).pressure_pa for one in (event, replace(event, signal="siren")))
     frequency, power = welch((warning - plain)[0], 3000.0, nperseg=1024)
     # The vehicle approaches in the hidden arm, so both tones are up to 3 % higher.
     tones = [(frequency > tone) & (frequency < 1.04 * tone) for tone in (400.0, 535.0)]
