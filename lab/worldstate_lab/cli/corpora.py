@@ -57,8 +57,6 @@ def study_lines(study: SignatureStudy) -> list[str]:
     return lines
 
 
-Corpora = tuple[ClipSignatures | None, ClipSignatures | None]
-
 NAMES = ("signatures.json", "signatures.txt")
 
 
@@ -80,7 +78,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         output_folder(arguments.out, *NAMES)
     # The second generator of two, as when the first simulated clips: folds and draws stay the same.
     _, draws = np.random.default_rng(arguments.seed).spawn(2)
-    corpora = published_corpora(arguments)
+    # Both folders are checked before the first clip is processed.
+    roadside = None if arguments.idmt is None else idmt_traffic(arguments.idmt)
+    city = None if arguments.melaudis is None else melaudis(arguments.melaudis)
+    corpora = _heard(IDMT, roadside, arguments.jobs), _heard(MELAUDIS, city, arguments.jobs)
     with progress_bar("measuring", len(QUESTIONS)) as bar:
         study = signature_study(*corpora, draws, bar.advance)
     report, lines = plain(study), study_lines(study)
@@ -92,16 +93,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     return CommandResult(report, table={}, lines=lines)
 
 
-def published_corpora(arguments: argparse.Namespace) -> Corpora:
-    """Read the corpora of --idmt and --melaudis; None for a missing one."""
-    # Both folders are checked before the first clip is processed.
-    roadside = None if arguments.idmt is None else idmt_traffic(arguments.idmt)
-    city = None if arguments.melaudis is None else melaudis(arguments.melaudis)
-    return _heard(IDMT, roadside, arguments.jobs), _heard(MELAUDIS, city, arguments.jobs)
-
-
 def _heard(name: str, clips: list[TrafficClip] | None, jobs: int) -> ClipSignatures | None:
-
     if clips is None:
         return None
     with progress_bar(f"processing {name}", len(clips)) as bar:

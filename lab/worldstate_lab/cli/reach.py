@@ -38,7 +38,7 @@ from worldstate.cli.common.progress import track
 from worldstate.cli.model.fit import add_group
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.checks import in_range
-from worldstate_lab.paper.identifiability import ReachOfArray, ReachOnData, reach_of_array, reach_on_table
+from worldstate_lab.paper.identifiability import ReachOfArray, reach_of_array, reach_on_table
 from worldstate_lab.report.table import Table, plain
 from worldstate_lab.signatures.clip_signatures import BandProfile, band_profile
 
@@ -63,7 +63,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
-    array, data, bands = _array(arguments), _data(arguments), _bands(arguments)
+    array, bands, data = _array(arguments), _bands(arguments), None
+    if arguments.features is not None:
+        table = read_features(arguments.features).group(arguments.group)
+        data = reach_on_table(table, arguments.method, np.random.default_rng(arguments.seed))
     found = {"array": array, "features": data, "bands": bands}
     report = {name: plain(one) for name, one in found.items() if one is not None}
     columns = np.degrees([array.azimuths_rad, array.std_rad, array.with_vision_rad]).tolist()
@@ -95,13 +98,6 @@ def _array(arguments: argparse.Namespace) -> ReachOfArray:
     return reach_of_array(
         array, np.radians(AZIMUTHS_DEG), frequencies, snr, arguments.snapshots, vision_std_rad=camera_rad
     )
-
-
-def _data(arguments: argparse.Namespace) -> ReachOnData | None:
-    if arguments.features is None:
-        return None
-    table = read_features(arguments.features).group(arguments.group)
-    return reach_on_table(table, arguments.method, np.random.default_rng(arguments.seed))
 
 
 def _bands(arguments: argparse.Namespace) -> BandProfile | None:

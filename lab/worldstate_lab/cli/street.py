@@ -121,17 +121,17 @@ def camera_numbers(recordings: Iterable[Sequence[Measurement]]) -> dict[str, flo
         tracks += linked_boxes([(seconds(ns), some) for ns, some in boxes], NEAR_RAD, _GAP_S)
     several = [one for one in tracks if len(one) > 1]
     view_rad = 2.0 * SITE.view_half_angle_rad
+    from_edge_rad = [
+        min(side.distance_rad(one.middle_rad, one.left_rad - one.right_rad) for side in SITE.sides)
+        for one, *_ in several
+    ]
     widths = [np.log([box.left_rad - box.right_rad for box in one]) for one in several]
     return {
         "clutter": (len(tracks) - len(several)) / images,
         "width_change": _rms(np.concatenate([np.diff(one) for one in widths])),
         "size_spread": float(np.std([one.mean() for one in widths])),
-        "edge_std_rad": _mixture(np.array([_from_edge_rad(one[0]) for one in several]), view_rad)[1],
+        "edge_std_rad": _mixture(np.array(from_edge_rad), view_rad)[1],
     }
-
-
-def _from_edge_rad(box: AzimuthBox) -> float:
-    return min(side.distance_rad(box.middle_rad, box.left_rad - box.right_rad) for side in SITE.sides)
 
 
 def _box(time_s: float, one: Sighting) -> AzimuthBox:

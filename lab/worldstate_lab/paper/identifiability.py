@@ -320,7 +320,13 @@ def reach_on_data(
     >>> round(found.information_plug_in, 2), found.error
     (0.53, 0.0)
     """
-    found, near = information_from_posteriors(posteriors, states), _neighbours(features, states)
+    found = information_from_posteriors(posteriors, states)
+    # On the leading components of the standardised features.
+    spread = features.std(axis=0)
+    standard = (features - features.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    _, _, axes = np.linalg.svd(standard, full_matrices=False)
+    leading = standard @ axes[:_COMPONENTS].T
+    near = nearest_neighbour_information_bits(leading / leading.std(axis=0), states)
     count = posteriors.shape[1]
     entropy = state_entropy_bits(states, count)
     largest = max(found.lower, found.plug_in, near)
@@ -421,15 +427,6 @@ def reach_of_array(
         with_vision_rad=together,
         endfire=endfire_information(array.positions_m, azimuths),
     )
-
-
-def _neighbours(x: FloatArray, states: IndexArray) -> float:
-    """Return the kNN estimate on the leading components of the standardised features."""
-    spread = x.std(axis=0)
-    x = (x - x.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    _, _, axes = np.linalg.svd(x, full_matrices=False)
-    components = x @ axes[:_COMPONENTS].T
-    return nearest_neighbour_information_bits(components / components.std(axis=0), states)
 
 
 def _spread(q: FloatArray, states: IndexArray, groups: AnyArray, rng: np.random.Generator) -> float:

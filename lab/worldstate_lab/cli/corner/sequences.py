@@ -80,11 +80,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
     _check(arguments)
+    boxes = None if arguments.boxes == "none" else arguments.boxes
     arguments.seeds = range(arguments.seed, arguments.seed + (1 if arguments.windows else SEEDS))
     start_s = round(in_range("--start", arguments.start, 0.0, _LONGEST_CUT_S), 1)
     recordings = [one.cut(start_s) for one in read_recordings(arguments.folder)]
     _check_kinds(recordings, "found one kind")
-    chains = [_chain(arguments, path) for path in _paths(arguments)]
+    paths = (arguments.path,) if arguments.path is not None else SPECTRA
+    if arguments.path is None and (arguments.folder / PAIR / "model.json").exists():
+        paths = get_args(PathName)
+    chains = [corner_chain(path, arguments.folder, arguments.model, boxes) for path in paths]
     report: dict[str, Any] = {"start_s": start_s, "boxes": arguments.boxes}
     lines, heard = list[str](), dict[PathName, Heard]()
     for chain in chains:
@@ -114,18 +118,6 @@ def _check(arguments: argparse.Namespace) -> None:
 def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:
     if len({one.hazard_free for one in recordings}) < 2:
         raise InvalidArgumentError(f"recordings: expected approaches and hazard-free ones; {found}")
-
-
-def _paths(arguments: argparse.Namespace) -> tuple[PathName, ...]:
-    if arguments.path is not None:
-        return (arguments.path,)
-    given = (arguments.folder / PAIR / "model.json").exists()
-    return get_args(PathName) if given else SPECTRA
-
-
-def _chain(arguments: argparse.Namespace, path: PathName) -> Chain:
-    boxes = None if arguments.boxes == "none" else arguments.boxes
-    return corner_chain(path, arguments.folder, arguments.model, boxes)
 
 
 def _heard(chain: Chain, recordings: Sequence[CornerRecording], jobs: int) -> tuple[Heard, dict[str, str]]:

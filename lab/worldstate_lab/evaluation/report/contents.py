@@ -20,7 +20,6 @@ from .degradation_section import awareness_figures, degradation_section, sweep_v
 from .measured_values import PROPOSED, MeasuredValues, printed, site_values
 from .warning_sections import cueing_section, table_i, tracking_section
 
-_UNMEASURED = "not measured"
 _TRANSFER = (
     *("detection", "lead_s", "false_alarms_per_hour", "random_detection", "auroc_all", "ece"),
     "side_correct",
@@ -41,11 +40,6 @@ def _label(one: PaperValue) -> str:
     # Without the unit.
     title = FIGURES[one.figure].title if one.figure in FIGURES else one.figure.replace("_", " ")
     return f"{one.row}: {title.partition(' (')[0]}"
-
-
-def _ours(one: PaperValue, measured: MeasuredValues) -> Value:
-    # With the decimals of the measured value: the paper rounds 0.0883 m to 0.088.
-    return replace(measured.at(one.group, one.row, one.figure, note=_UNMEASURED), paper=None)
 
 
 def front_end_section(measured: MeasuredValues) -> Section:
@@ -98,18 +92,12 @@ def _junction_table(found: Evaluation) -> Table:
 def paper_section(measured: MeasuredValues) -> Section:
     """Return every number of the paper beside ours, with the command and the data that compute it."""
     simulated = measured.found.takes.simulated
-    rows = [
-        (
-            one.section,
-            one.group,
-            _label(one),
-            printed(one),
-            one.unit,
-            _ours(one, measured),
-            _filled(one, simulated),
-        )
-        for one in PAPER_VALUES
-    ]
+    rows: list[tuple[Cell, ...]] = []
+    for one in PAPER_VALUES:
+        # With the decimals of the measured value: the paper rounds 0.0883 m to 0.088.
+        ours = replace(measured.at(one.group, one.row, one.figure, note="not measured"), paper=None)
+        of = one.section, one.group, _label(one), printed(one), one.unit
+        rows.append((*of, ours, _filled(one, simulated)))
     text = (
         "The recordings here are SIMULATED: if the last column contains a command, the paper's number comes "
         "from real sound or video, and the number printed here is its simulated counterpart."
