@@ -70,11 +70,11 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     if arguments.budget is not None:
         model = replace(model, sequence=parts_of(model)[1].asking(budget=arguments.budget))
     arguments.streams.mkdir(parents=True, exist_ok=True)
-    every = [(i, site, arguments.minutes) for i, site in enumerate(arguments.sites, arguments.seed)]
+    sites = [(seed, junction_named(site)) for seed, site in enumerate(arguments.sites, arguments.seed)]
     plan = [
-        StreamSettings(junction_named(site), minutes, seed, traffic_named(name), sample_rate_hz=RATE_HZ)
+        StreamSettings(site, arguments.minutes, seed, traffic_named(name), sample_rate_hz=RATE_HZ)
         for name in dict.fromkeys(chain.from_iterable(SCENARIOS[name] for name in names))
-        for seed, site, minutes in every
+        for seed, site in sites
     ]
     found = in_processes(partial(followed, model=model, folder=arguments.streams), plan, arguments.jobs)
     streams: dict[str, list[Followed]] = {}

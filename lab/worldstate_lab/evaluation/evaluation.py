@@ -97,13 +97,7 @@ def evaluate(
         one.name: run_protocol(one, some, methods_for(some), classifiers, settings.seeds)
         for one, some in track(own.items(), "fitting and deciding", len(own))
     }
-    scores = {
-        name: {
-            method: Score.of(run.trials, passes)
-            for method, passes in track(run.decisions.items(), "scoring", len(run.decisions))
-        }
-        for name, run in runs.items()
-    }
+    scores = {name: _scored(run, track) for name, run in runs.items()}
     rng = np.random.default_rng(settings.seeds[0])
     drawn = {
         name: stratified_draws([(t.label, t.site) for t in run.trials], rng, settings.draws)
@@ -127,6 +121,11 @@ def evaluate(
     refused = {one.name: refused_methods(some) for one, some in own.items()}
     of = takes, tuple(trials), tuple(failed), lacking
     return Evaluation(*of, runs, scores, drawn, front_end, sweep, settings, refused, equal)
+
+
+def _scored(run: ProtocolRun, track: Progress) -> dict[str, Score]:
+    every = track(run.decisions.items(), "scoring", len(run.decisions))
+    return {method: Score.of(run.trials, passes) for method, passes in every}
 
 
 def _left(takes: TakeList, trials: Sequence[Trial]) -> TakeList:
