@@ -42,7 +42,7 @@ def assert_budget(figures):
 
 @pytest.mark.long
 def test_a_standing_ego_at_a_junction_never_seen():
-    figures = compared("static", "lojo", ("loudest_direction",))
+    figures = compared("static", "lojo", ("baseline",))
     assert figures["auroc_macro"] >= 0.97
     assert figures["auroc_pooled"] >= 0.965
     assert figures["worst_group_auroc"] >= 0.94
@@ -51,7 +51,7 @@ def test_a_standing_ego_at_a_junction_never_seen():
     assert_budget(figures)
     assert figures["ece"] <= figures["ece_floor"] + 2 * figures["ece_floor_std"]
     for key in ("auroc_macro", "auroc_pooled", "tpr"):
-        assert figures["gains"]["loudest_direction"][key]["low"] > 0
+        assert figures["gains"]["baseline"][key]["low"] > 0
 
 
 @pytest.mark.long
@@ -96,11 +96,10 @@ def test_from_a_standing_to_a_moving_ego():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["lojo", "cv", "transfer"])
-@pytest.mark.parametrize("row", ["baseline", "loudest_direction"])
-def test_a_moving_ego_improves_on_every_other_row(protocol, row):
-    figures = compared("dynamic", protocol, ("baseline", "loudest_direction"))
-    assert figures["gains"][row]["auroc_pooled"]["gain"] > 0
-    assert figures["gains"][row]["brier"]["gain"] < 0
+def test_a_moving_ego_improves_on_the_published_classifier(protocol):
+    gains = compared("dynamic", protocol, ("baseline",))["gains"]["baseline"]
+    assert gains["auroc_pooled"]["gain"] > 0
+    assert gains["brier"]["gain"] < 0
 
 
 def command(*words):
@@ -113,7 +112,7 @@ def test_the_command_prints_every_row(capsys):
     assert command(*words, "--json") == 0
     figures = json.loads(capsys.readouterr().out)
     assert set(figures["rows"]) == {
-        "baseline", "loudest_direction", "distant_site_cold", "distant_site_curated", "ensemble_run",
+        "baseline", "distant_site_cold", "distant_site_curated", "ensemble_run",
     }  # fmt: skip
     for row in (figures, *figures["rows"].values()):
         for key, (low, high) in row["intervals"].items():

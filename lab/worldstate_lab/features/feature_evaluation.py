@@ -15,7 +15,7 @@ from scipy.special import expit, logit
 
 from worldstate.abduction.cueing.risk_map import fit_isotonic, fit_platt
 from worldstate.abduction.signature.ensemble import EnsembleModel
-from worldstate.abduction.signature.ensemble_training import SiteEnsembleClassifier
+from worldstate.abduction.signature.ensemble_training import SimulatedWindows, SiteEnsembleClassifier
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
 from worldstate.adapters.datasets.feature_table import N_FEATURES, FeatureTable
 from worldstate.adapters.files.acoustic_domain import check_tables, ovad_domain
@@ -32,6 +32,7 @@ from worldstate.operations.training.training import (
     folds_by_recording,
     junction_folds,
     out_of_fold,
+    trained_ensemble,
 )
 from worldstate_lab.features.published_classifier import Classifier
 
@@ -47,7 +48,8 @@ SMALLEST_RISK = 1e-6
 class WindowMethod:
     """One way to compute a risk from windows."""
 
-    make: Callable[[np.random.Generator], Classifier]  # Returns an untrained classifier
+    # Returns an untrained classifier; None: the ensemble, trained as in `model fit`.
+    make: Callable[[np.random.Generator], Classifier] | None = None
     miss_rate: float = ABSENT_MISS_RATE  # beta of the statistic
     # Reference of the scored windows, None if the method uses none. Training is the same in any case, as in
     # `model fit`.
@@ -57,8 +59,7 @@ class WindowMethod:
     # training. Otherwise the threshold of an ensemble is a compromise between folds by junction and folds by
     # recording.
     afar: bool = False
-    # Training function, if it needs more than windows and labels; otherwise `make` is used.
-    fit: Callable[[FeatureTable], Classifier] | None = None
+    simulated: SimulatedWindows | None = None  # On which the ensemble is trained, too
 
     def prepare(self, table: FeatureTable) -> FeatureTable:
         """Return the table in the form that the classifier receives."""
@@ -66,8 +67,8 @@ class WindowMethod:
 
     def trained(self, table: FeatureTable, rng: np.random.Generator) -> Classifier:
         """Return a classifier trained on a prepared table."""
-        if self.fit is not None:
-            return self.fit(table)
+        if self.make is None:
+            return trained_ensemble(table, simulated=self.simulated)
         return self.make(rng).fit(table.features, table.labels, table.environments)
 
     def posteriors(self, table: FeatureTable, rng: np.random.Generator, inner: Protocol = "cv") -> FloatArray:

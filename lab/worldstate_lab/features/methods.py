@@ -1,53 +1,16 @@
 """Methods and baselines of an evaluation on feature windows."""
 
 from dataclasses import replace
-from functools import partial
-from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from worldstate.abduction.signature.ensemble import log_levels
 from worldstate.abduction.signature.ensemble_training import Recipe, SimulatedWindows, SiteEnsembleClassifier
-from worldstate.abduction.signature.window_classes import CLASSES, FRONT, LEFT, NONE, RIGHT
-from worldstate.ground.typing import FloatArray
-from worldstate.operations.training.training import PUBLISHED_MISS_RATE, trained_ensemble
+from worldstate.operations.training.training import PUBLISHED_MISS_RATE
 from worldstate_lab.features.published_classifier import Classifier, PublishedClassifier
 
 from .feature_evaluation import Protocol, Reference, WindowMethod
 
 REFERENCES: tuple[Reference, ...] = ("run", "cold", "curated")
-
-
-class LoudestDirection:
-    """Hazard odds equal to the highest level of the spatial spectrum; not trained.
-
-    Examples
-    --------
-    >>> LoudestDirection().fit([[0.1]], ["none"]).predict_proba([[0.25, 1.0]])
-    array([[0.  , 0.25, 0.5 , 0.25]])
-    """
-
-    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
-        """Do nothing."""
-        return self
-
-    def predict_proba(self, X: ArrayLike) -> FloatArray:
-        """Return posteriors of front, left, none, right, shape (n, 4): no side is preferred."""
-        odds = np.exp(log_levels(X).max(axis=1))
-        posteriors = np.zeros((len(odds), len(CLASSES)))
-        posteriors[:, NONE] = 1.0 / (1.0 + odds)
-        posteriors[:, LEFT] = posteriors[:, RIGHT] = odds / (1.0 + odds) / 2.0
-        posteriors[:, FRONT] = 0.0
-        return posteriors
-
-
-def _loudest_direction(rng: np.random.Generator) -> Classifier:
-    return LoudestDirection()
-
-
-def _site_ensemble(rng: np.random.Generator, simulated: SimulatedWindows | None) -> Classifier:
-    return SiteEnsembleClassifier(simulated=simulated)
 
 
 def _distant_site(rng: np.random.Generator) -> Classifier:
@@ -60,16 +23,12 @@ def _distant_site(rng: np.random.Generator) -> Classifier:
 
 def methods(simulated: SimulatedWindows | None = None) -> dict[str, WindowMethod]:
     """Return the methods by name; with simulated windows, the ensembles are trained on them too."""
-    # Trained as in `model fit`.
-    ensemble = WindowMethod(
-        partial(_site_ensemble, simulated=simulated), fit=partial(trained_ensemble, simulated=simulated)
-    )
+    ensemble = WindowMethod(simulated=simulated)
     # For a moving ego only the pattern is used, because streets with a standing ego reduce its accuracy
     # (lab/NOTES.md).
     distant = WindowMethod(_distant_site, afar=True)
     return {
         "baseline": WindowMethod(PublishedClassifier, PUBLISHED_MISS_RATE),
-        "loudest_direction": WindowMethod(_loudest_direction),
         **{f"ensemble_{one}": replace(ensemble, reference=one) for one in REFERENCES},
         **{f"distant_site_{one}": replace(distant, reference=one) for one in REFERENCES},
     }
@@ -92,7 +51,7 @@ def rows_beside(row: str, protocol: Protocol, reference: Reference) -> tuple[str
     others = tuple(row_of("worldstate", protocol, other) for other in REFERENCES if other != reference)
     # If the motion of the ego differs from training, the ensemble is a baseline too.
     afar = (f"ensemble_{reference}",) if protocol == "transfer" else ()
-    return ("baseline", "loudest_direction", *others, *afar)
+    return ("baseline", *others, *afar)
 
 
 def method_of(method: str) -> WindowMethod:
