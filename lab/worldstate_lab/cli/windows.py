@@ -10,8 +10,8 @@ Evaluate a signature classifier and its cueing on labelled feature windows.
   --method worldstate  windows relative to the average of their site; mirror-symmetric ensemble; eq. (6)
                        without the visible explanation. "rows" and "gains" compare it with the baseline
                        and with itself under the other references. Under transfer it is one expert of the
-                       pattern above the site's quiet windows, its
-                       risks shifted until hazards are as frequent as in training, and the ensemble is a row
+                       pattern above the site's quiet windows, its risks shifted until hazards are as frequent
+                       as in training, and the ensemble is a row
 
   --reference run      as in `run`: learned from the ten preceding windows of a second, drawn from other
                        recordings of the junction, one in twenty of them a hazard; no label is used
