@@ -241,12 +241,11 @@ def test_a_model_outside_its_domain_has_rows_without_numbers(evaluation, tmp_pat
     assert "&lt;b>: not the array of the model" in (tmp_path / "report.md").read_text("utf-8")
 
 
-def test_an_approach_without_video_is_drawn_without_images_and_states_it():
+def test_the_boxes_of_one_image_are_counted_at_its_hop():
     times = 1.0 + 0.1 * np.arange(20)
     boxes = HopTable({"time_s": np.array([0.5, 2.0, 2.01]), "moving": np.ones(3, bool)})
     said = Decisions.of(times, times > 1.5, score=np.linspace(0, 1, 20), threshold=np.array([0.5]))
-    figure = approach_figure("a", Trial(HopTable({"time_s": times}, "a", "left", 1.9), boxes), said)
-    assert "left out" in figure.caption
+    figure = approach_figure("a", Trial(HopTable({"time_s": times}, "a", "left", 1.9), boxes), said, ())
     # The boxes of one image are counted at its hop, each once.
     assert sum(row[3] for row in figure.rows) == 2
 

@@ -38,43 +38,35 @@ class ApproachImage:
     column_px: float | None = None
 
 
-def approach_figure(
-    title: str, trial: Trial, said: Decisions, images: Sequence[ApproachImage] = ()
-) -> Figure:
-    """Draw an approach like the paper's timeline figure; without images their row is omitted."""
+def approach_figure(title: str, trial: Trial, said: Decisions, images: Sequence[ApproachImage]) -> Figure:
+    """Draw an approach like the paper's timeline figure."""
     # Before the first hop, parked and moving cars cannot be distinguished.
     moving = trial.boxes.moving.astype(bool) & (trial.boxes.time_s >= said.time_s[0])
     seen_s = trial.boxes.time_s[moving]
 
     def draw(canvas: "Canvas") -> None:
-        rows = 2 if images else 1
-        grid = canvas.add_gridspec(rows, max(len(images), 1), height_ratios=(0.62, 1.0)[-rows:])
+        grid = canvas.add_gridspec(2, len(images), height_ratios=(0.62, 1.0))
         for i, image in enumerate(images):
             _draw_image(canvas.add_subplot(grid[0, i]), image)
-        _draw_statistic(canvas.add_subplot(grid[rows - 1, :]), trial.t0_s, said, seen_s)
+        _draw_statistic(canvas.add_subplot(grid[1, :]), trial.t0_s, said, seen_s)
         legend_below(canvas, columns=5)
 
     # A box between two hops belongs to the later one, which is the first that can use it.
     at = np.searchsorted(said.time_s - 1e-6, seen_s)
     boxes = np.bincount(at, minlength=said.time_s.size + 1)[: said.time_s.size]
-    camera = (
-        "Above: camera images; the dashed box is the vehicle as the camera reports it, the dotted line the "
-        "direction in which it is hidden. "
-        if images
-        else "The recording has no video that could be read, so the row of camera images is left out. "
-    )
     return Figure(
         "approach_timeline",
         title,
-        f"{camera}Below: hazard statistic at the end of each 1-s window, threshold, advisory, moving boxes "
-        "of the camera, and line-of-sight entry T0.",
+        "Above: camera images; the dashed box is the vehicle as the camera reports it, the dotted line the "
+        "direction in which it is hidden. Below: hazard statistic at the end of each 1-s window, threshold, "
+        "advisory, moving boxes of the camera, and line-of-sight entry T0.",
         draw,
         ("time_s", "statistic", "advisory", "moving_boxes"),
         [
             (float(t), float(s), int(on), int(n))
             for t, s, on, n in zip(said.time_s, said.score, said.alarm, boxes, strict=True)
         ],
-        size_in=(9.0, 5.4 if images else 3.4),
+        size_in=(9.0, 5.4),
     )
 
 
