@@ -177,7 +177,8 @@ def _halves(
 ) -> FloatArray:
     """Return the mean squared distance between two random halves of each real junction, shape (11,)."""
     number, dealt = len(strata), np.zeros((2, len(strata)))
-    for one in set(strata):
+    # In the order of the excerpts: a set of names has another order, and so other draws, in every run.
+    for one in dict.fromkeys(strata):
         some = rng.permutation([i for i in range(number) if strata[i] == one])
         dealt[0, some[::2]] = dealt[1, some[1::2]] = 1.0
     junctions = sorted({name for _, name, _ in strata})
