@@ -29,14 +29,16 @@ from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.datasets.ovad import OvadDataset, read_true_tracks
 from worldstate.adapters.export.log_messages import SNAPSHOT_TOPIC, read_messages
-from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.context_file import read_context
+from worldstate.adapters.files.file_io import atomic_path, write_text
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.files.odometry_file import read_odometry
 from worldstate.adapters.ros.bag_input import read_sound
 from worldstate.adapters.state_log import read_log, read_state_near
 from worldstate.adapters.vehicle.car_file import read_camera_setup, read_car
+from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, WorldstateError
 from worldstate.operations.labelling.street_passes import read_street
 from worldstate.operations.recordings.hop_table import HopTable, load_streams, save_tables
@@ -411,3 +413,41 @@ def test_many_members_and_many_empty_streams_are_refused(tmp_path: Path) -> None
     save_tables(path, [HopTable({"time_s": np.zeros(0)}, name="a")] * 100_001)
     with pytest.raises(InputFileError, match="at most 100000 tables"):
         load_streams(path)
+
+
+# Files and folders are written whole or not at all.
+
+
+def test_a_failed_write_leaves_the_old_file_and_a_finished_one_replaces_it(tmp_path: Path) -> None:
+    name = tmp_path / "states.npz"
+    write_text(name, "old")
+    with pytest.raises(RuntimeError), atomic_path(name) as temporary:
+        temporary.write_text("half a line")
+        assert name.read_text() == "old"
+        raise RuntimeError
+    assert [path.name for path in tmp_path.iterdir()] == ["states.npz"]
+    assert name.read_text() == "old"
+    with atomic_path(name) as temporary:
+        np.savez(temporary, value=2)
+    assert [path.name for path in tmp_path.iterdir()] == ["states.npz"]
+    assert np.load(name)["value"] == 2
+
+
+def test_folders_are_written_whole_too(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "set") as temporary:
+        temporary.mkdir()
+        (temporary / "one").write_text("1")
+    with pytest.raises(RuntimeError), atomic_path(tmp_path / "other") as temporary:
+        temporary.mkdir()
+        (temporary / "one").write_text("1")
+        raise RuntimeError
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["set", "set/one"]
+
+
+def test_writers_refuse_a_missing_folder_and_a_folder(tmp_path: Path) -> None:
+    (taken := tmp_path / "taken").mkdir()
+    with pytest.raises(InputFileError, match=r"nowhere/mics.xml: expected an existing folder"):
+        write_array_xml(tmp_path / "nowhere" / "mics.xml", MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]))
+    with pytest.raises(InputFileError, match=r"taken: .*found a folder"):
+        write_text(taken, "x")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
