@@ -18,7 +18,6 @@ from worldstate_lab.sequences.path_figures import exam_figures
 from worldstate_lab.sequences.path_tables import alarm_table
 from worldstate_lab.sequences.recordings import NANODET_BOXES
 from worldstate_lab.sequences.scores import alarm_row, calibration, curve, hop_before, leads, sweep
-from worldstate_lab.sequences.window_rows import FILTERS
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.adapters.files.array_file import read_array
@@ -208,25 +207,6 @@ def test_the_command_scores_a_made_up_corner(tmp_path, capsys) -> None:
     assert "sequences corner" in json.loads((tmp_path / "results.json").read_text())
 
 
-def test_the_shipped_filter_is_the_product_and_every_use_of_windows_differs(tmp_path, capsys) -> None:
-    folder, found = write_corner(tmp_path / "corner", draw()), []
-    for words in (["--windows"], []):
-        assert main(["sequences", str(folder), "--path", "seven", "--json", *words]) == 0
-        found.append(json.loads(capsys.readouterr().out)["seven"])
-    windows, product = found
-    for camera, row in (("with the camera", ""), ("sound alone", ", sound alone")):
-        ships = windows[camera]["sequence"]
-        assert ships["alarms"]["text"] == product["rows"][f"world-state advisory{row}"]["text"]
-        score = product["scores"]["product, with camera" if not row else "product, sound alone"]
-        for lead in ("0.5", "1", "2"):
-            for figure in ("auroc", "auroc_all_hops", "side_auroc"):
-                assert ships["leads"][lead][figure] == score["leads"][lead][figure]
-    assert ships["within_1s"]["brier_skill"] is not None
-    # All variants differ from one another.
-    first, *others = (windows["sound alone"][one.name]["at_onset"]["threshold"] for one in FILTERS)
-    assert len({first, *others}) == len(FILTERS)
-
-
 def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) -> None:
     folder = write_corner(tmp_path / "corner", draw())
     assert main(["sequences", str(folder), "--boxes", "none", "--start", "1"]) == 0
@@ -242,8 +222,7 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
     [
         (["--features", "a.csv"], "--lists"),
         (["--model", "a.json"], "--path"),
-        (["--path", "seven", "--streams", "a.npz"], "neither --path"),
-        (["--windows", "--streams", "a.npz"], "nor --windows"),
+        (["--path", "seven", "--streams", "a.npz"], "expected no --path"),
         (["--start", "9"], "--start"),
     ],
 )

@@ -246,12 +246,12 @@ def sweep(trials: Sequence[Trial], scores: Sequence[FloatArray]) -> Mapping[str,
     return found | {"level": levels}
 
 
-def calibration(trials: Sequence[Trial], rng: np.random.Generator, *, within_s: float = WITHIN_S) -> Row:
-    """Return calibration and skill of the chances that a vehicle comes into view within a time on a side.
+def calibration(trials: Sequence[Trial], rng: np.random.Generator) -> Row:
+    """Return calibration and skill of the chances that a vehicle comes into view within `WITHIN_S` on a side.
 
     Both sides are used, at hops before T0 of approaches and at all hops of hazard-free recordings.
     """
-    parts = [_chances(one, within_s) for one in trials]
+    parts = [_chances(one) for one in trials]
     if not sum(map(len, parts)):
         return {"ece": None, "brier_skill": None, "base_rate": None, "hops": 0}
     every = np.concatenate(parts)
@@ -282,11 +282,11 @@ def _calibrated(pairs: AnyArray) -> dict[str, float | None]:
     return {"ece": expected_calibration_error(said, true), "brier_skill": brier_skill(said, true)}
 
 
-def _chances(trial: Trial, within_s: float) -> FloatArray:
+def _chances(trial: Trial) -> FloatArray:
     """Return the predicted chance and the outcome of each side, shape (2 n, 2)."""
-    said = trial.hops.within[:, :, HORIZONS_S.index(within_s)]
+    said = trial.hops.within[:, :, HORIZONS_S.index(WITHIN_S)]
     coming_s = (trial.t0_s - trial.hops.time_s)[:, None] + np.zeros(len(SIDES))
     own = np.array([side == trial.label for side in SIDES])
-    true = own & (coming_s <= within_s + SLACK_S)
+    true = own & (coming_s <= WITHIN_S + SLACK_S)
     scored = np.isfinite(said) & (trial.hazard_free | (coming_s > SLACK_S))
     return np.stack([said[scored], true[scored]], axis=-1)

@@ -20,7 +20,6 @@ Examples
   worldstate-lab sequences ovad-sequences --path seven --jobs 2
   worldstate-lab sequences ovad-sequences --features extracted_features.csv --lists static.csv dynamic.csv
   worldstate-lab sequences ovad-sequences --path pair --boxes none --start 1 --json
-  worldstate-lab sequences ovad-sequences --windows
 """
 
 import argparse
@@ -53,7 +52,6 @@ from worldstate_lab.sequences.path_tables import FOLLOWED, path_lines, scores_ta
 from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
 from worldstate_lab.sequences.summed_scores import LevelReading, summed_scores
 from worldstate_lab.sequences.tracking import tracking_figures
-from worldstate_lab.sequences.window_rows import window_lines, window_rows
 from worldstate_lab.trials.pass_cache import Failed, attempted
 
 EXAM = "exam.json"
@@ -71,7 +69,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--features", type=Path, metavar="CSV", help="training windows of the published classifier")
     add("--lists", type=Path, nargs="+", default=[], metavar="CSV", help="recordings left out of training")
     add("--streams", type=Path, nargs="+", default=[], metavar="NPZ", help="of the pair, for the summed rows")
-    add("--windows", action="store_true", help="only compare ways to use windows in the filter")
     add("--start", type=float, default=0.0, metavar="S", help="cut off at the start (default: %(default)s)")
     add("--seed", type=int, default=1, help="seed of folds and intervals (default: %(default)s)")
     add("--jobs", type=int, default=1, help="processes (default: 1)")
@@ -81,7 +78,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     """Run the command; return its result."""
     _check(arguments)
     boxes = None if arguments.boxes == "none" else arguments.boxes
-    arguments.seeds = range(arguments.seed, arguments.seed + (1 if arguments.windows else SEEDS))
+    arguments.seeds = range(arguments.seed, arguments.seed + SEEDS)
     start_s = round(in_range("--start", arguments.start, 0.0, _LONGEST_CUT_S), 1)
     recordings = [one.cut(start_s) for one in read_recordings(arguments.folder)]
     _check_kinds(recordings, "found one kind")
@@ -92,10 +89,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     report: dict[str, Any] = {"start_s": start_s, "boxes": arguments.boxes}
     lines, heard = list[str](), dict[PathName, Heard]()
     for chain in chains:
-        if arguments.windows:
-            report[chain.path] = window_rows(chain, recordings, arguments.seed, arguments.jobs)
-            lines += window_lines(chain.path, report[chain.path])
-            continue
         heard[chain.path], failed = _heard(chain, recordings, arguments.jobs)
         report[chain.path] = _figures(arguments, chain, heard[chain.path]) | {"failed": failed}
         lines += [*path_lines(chain.path, report[chain.path]), ""]
@@ -111,8 +104,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidArgumentError("--features: expected together with --lists, to exclude test recordings")
     if arguments.model is not None and arguments.path is None:
         raise InvalidArgumentError("--model: expected --path, for which it was made")
-    if arguments.streams and (arguments.path is not None or arguments.windows):
-        raise InvalidArgumentError("--streams: expected neither --path nor --windows, got one")
+    if arguments.streams and arguments.path is not None:
+        raise InvalidArgumentError("--streams: expected no --path, because sums use all of them")
 
 
 def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:
