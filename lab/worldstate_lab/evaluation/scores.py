@@ -29,6 +29,7 @@ from worldstate_lab.metrics.intervals import (
     poisson_upper,
     random_detection,
     ratio,
+    weighted_areas,
     weighted_median,
     worst_group,
 )
@@ -179,22 +180,16 @@ class Score:
             "quantum_per_hour": ratio(np.ones_like(hours), hours),
             "random_detection": self._random_detection(weights, sums),
         }
-        figures |= self._areas(weights) | self._calibration(weights, sums) | _visible_figures(sums)
+        areas = {
+            f"auroc_{horizon}": weighted_areas(
+                self.wins[:, i], self.counts[f"windows_{horizon}"], ~self._free, weights
+            )
+            for i, horizon in enumerate(reduction.HORIZONS_S)
+        }
+        figures |= areas | self._calibration(weights, sums) | _visible_figures(sums)
         samples = [_bearing_figures(table, weights) for table in self.bearings]
         figures |= {name: np.array([one[name] for one in samples]) for name in samples[0]}
         return {name: known_mean(values) for name, values in figures.items()}
-
-    def _areas(self, weights: FloatArray) -> dict[str, FloatArray]:
-        r"""Return the areas under the ROC curve: :math:`w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)`."""
-        # Wins are counted once per pair of recordings. A draw weights them; its windows need not be ranked
-        # again.
-        high, low = weights[:, ~self._free], weights[:, self._free]
-        areas = {}
-        for i, horizon in enumerate(reduction.HORIZONS_S):
-            windows = self.counts[f"windows_{horizon}"]
-            pairs = (windows[:, ~self._free] @ high.T) * (windows[:, self._free] @ low.T)
-            areas[f"auroc_{horizon}"] = ratio(((high @ self.wins[:, i]) * low).sum(axis=-1), pairs)
-        return areas
 
     def _calibration(self, weights: FloatArray, sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         shape = (*self.bins.shape[:2], len(weights), BINS, 3)

@@ -182,6 +182,26 @@ def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
     return quotient
 
 
+def weighted_areas(
+    wins: FloatArray, windows: FloatArray, positive: BoolArray, weights: FloatArray
+) -> FloatArray:
+    r"""Return the AUROC with weight weights[d, r] for recording r, NaN if a label is missing, shape (..., D).
+
+    Shapes: wins (..., P, Q) as from `rank_wins`, windows (..., R), positive (R,), weights (D, R). Wins are
+    counted once per pair of recordings; a draw weights them, so its windows need not be ranked again.
+
+    .. math:: w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)
+
+    Examples
+    --------
+    >>> weighted_areas(np.array([[1.5]]), np.array([1.0, 2.0]), np.array([True, False]), np.ones((1, 2)))
+    array([0.75])
+    """
+    high, low = weights[:, positive], weights[:, ~positive]
+    pairs = (windows[..., positive] @ high.T) * (windows[..., ~positive] @ low.T)
+    return ratio(((high @ wins) * low).sum(axis=-1), pairs)
+
+
 def known_mean(values: FloatArray) -> FloatArray:
     """Return the mean over the first axis, without NaN.
 

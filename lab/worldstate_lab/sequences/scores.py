@@ -29,7 +29,13 @@ from worldstate.operations.metrics.approach_table import (
     share_interval,
 )
 from worldstate_lab.evaluation.reduction import hop_of
-from worldstate_lab.metrics.intervals import draw_weights, middle, pooled_draws, ratio, stratified_draws
+from worldstate_lab.metrics.intervals import (
+    draw_weights,
+    middle,
+    pooled_draws,
+    stratified_draws,
+    weighted_areas,
+)
 from worldstate_lab.trials.trial import Trial
 
 LEADS_S = (0.5, 1.0, 1.5, 2.0, 3.0)
@@ -62,20 +68,10 @@ def hop_before(trial: Trial, lead_s: float) -> IndexArray:
 
 
 def areas(parts: Sequence[FloatArray], positive: BoolArray, weights: FloatArray) -> FloatArray:
-    r"""Return the AUROC with weight weights[d, r] for recording r, NaN if a label is missing, shape (D,).
-
-    .. math:: w_P^T W w_Q / (w_P^T n_P \, w_Q^T n_Q)
-
-    Examples
-    --------
-    >>> parts, positive = [np.array([0.9]), np.array([0.1, 0.9])], np.array([True, False])
-    >>> areas(parts, positive, np.ones((1, 2))).tolist()
-    [0.75]
-    """
-    high, low = weights[:, positive], weights[:, ~positive]
+    """Return the AUROC of the scores of recordings, one part each, under each row of weights, shape (D,)."""
     near, calm = ([parts[i] for i in np.flatnonzero(of).tolist()] for of in (positive, ~positive))
-    pairs = (high @ [len(one) for one in near]) * (low @ [len(one) for one in calm])
-    return ratio(((high @ rank_wins(near, calm)) * low).sum(axis=1), pairs)
+    windows = np.array([len(one) for one in parts], np.float64)
+    return weighted_areas(rank_wins(near, calm), windows, positive, weights)
 
 
 def strata(trials: Sequence[Trial]) -> list[tuple[str, str]]:
