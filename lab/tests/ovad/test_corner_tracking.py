@@ -1,7 +1,6 @@
 """Properties of tracks at a corner: on artificial recordings, and on the real ones if they are available.
 
-OVAD_SEQUENCES is the folder of the real recordings, by default beside the repository; OVAD_ROOT is the whole
-data set in its own layout.
+OVAD_SEQUENCES is the folder of the real recordings, by default beside the repository.
 """
 
 import json
@@ -17,16 +16,13 @@ import pytest
 from made_up_corner import write_corner
 from worldstate_lab.sequences.hearing import Chain, ovad_chain
 from worldstate_lab.sequences.recordings import TRUTH, read_recordings
-from worldstate_lab.sequences.tracking import NEAR_RAD, OC_SORT, WORLD, tracked, tracking_figures
+from worldstate_lab.sequences.tracking import OC_SORT, WORLD, tracked, tracking_figures
 from worldstate_lab.trials.listening import likely_movers
-from worldstate_lab.trials.pass_cache import Hearer
-from worldstate_lab.trials.trial import find_takes
 
 from worldstate.adapters import read_array, read_model
 from worldstate.state import Entity
 
 SEQUENCES = Path(os.environ.get("OVAD_SEQUENCES") or Path(__file__).parents[4] / "shared" / "ovad-sequences")
-ROOT = os.environ.get("OVAD_ROOT")
 # GOSPA at 60 degrees for one vehicle without a track.
 MISS_DEG = 30.0
 
@@ -187,53 +183,3 @@ def test_there_are_few_vehicles_in_empty_streets(real):
     # Of the snapshots of all 22, 0.05 contain a vehicle in view by the camera, 0.003 a hidden one.
     assert np.sum([len(one["visible"]) for one in found]) < 0.2 * 90 * len(calm)
     assert np.sum([len(one["hidden"]) for one in found]) < 0.05 * 90 * len(calm)
-
-
-@pytest.fixture(scope="module")
-def takes():
-    if ROOT is None:
-        pytest.skip("no data set in OVAD's own layout: set OVAD_ROOT")
-    return find_takes(Path(ROOT))
-
-
-@pytest.fixture(scope="module")
-def heard(takes, tmp_path_factory):
-    """The static approaches processed with the whole array."""
-    hearing = Hearer(tmp_path_factory.mktemp("heard"))
-    return [hearing(one) for one in takes.static if not one.hazard_free]
-
-
-@pytest.mark.long
-def test_with_all_microphones_the_entity_in_view_existed_before(heard):
-    warned = [one for one in heard if one.chains["filtered"].alarm[one.hops.before_sight()].any()]
-    assert warned
-    assert np.mean([_was_there_before(one) for one in warned]) > 0.2
-
-
-@pytest.mark.long
-def test_with_all_microphones_bearings_in_view_are_near_moving_boxes(heard):
-    errors = np.concatenate([one.hops.srp_rad - one.hops.reference_rad for one in heard])
-    assert np.degrees(np.nanmedian(np.abs(errors))) < 7.0  # The paper's median is 3.4 degrees
-
-
-@pytest.mark.long
-def test_with_all_microphones_the_dynamic_list_is_processed_if_available(takes, tmp_path_factory):
-    if not takes.dynamic:
-        pytest.skip("no dynamic recordings in the data set: not run")
-    hearing = Hearer(tmp_path_factory.mktemp("dynamic"))
-    assert all(one.hops.about["moving"] and len(one.hops) for one in map(hearing, takes.dynamic))
-
-
-def _was_there_before(trial):
-    """Return whether the track nearest to the vehicle in most of its images began before T0."""
-    tracks, nearest = trial.chains["filtered"].tracks, []
-    seen = trial.truth.in_view.astype(bool) & (trial.truth.vehicle == 0)
-    for time_s, azimuth_rad in zip(trial.truth.time_s[seen], trial.truth.azimuth_rad[seen], strict=True):
-        now = np.flatnonzero(np.abs(tracks.time_s - time_s) < 0.05)
-        apart = np.abs(tracks.azimuth_rad[now] - azimuth_rad)
-        if apart.min(initial=np.inf) < NEAR_RAD:
-            nearest.append(tracks.track[now[apart.argmin()]])
-    if not nearest:
-        return False
-    numbers, counts = np.unique(nearest, return_counts=True)
-    return bool(tracks.time_s[tracks.track == numbers[counts.argmax()]].min() < trial.t0_s - 0.05)
