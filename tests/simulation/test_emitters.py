@@ -284,19 +284,23 @@ def test_folders_of_recordings_have_the_names_of_kinds(tmp_path):
         recorded_kinds(str(tmp_path / "good" / ".git"))
 
 
-def test_the_command_accepts_a_folder_among_the_kinds(tmp_path, capsys):
+def test_the_command_adds_and_reports_kinds_and_a_folder(tmp_path, capsys):
     write_array_xml(tmp_path / "pair.xml", PAIR)
     folder = folder_of(tmp_path / "own", "voice", band_noise(2.0, 16_000), 16_000)
-    words = f"--static 1 --duration 0.5 --bandwidth 2000 --array {tmp_path / 'pair.xml'} --sounds"
+    words = "--static 1 --scene merge --duration 0.5 --bandwidth 2000"
+    words += f" --array {tmp_path / 'pair.xml'} --sounds"
     audio = []
     for out, jobs in (("a", "1"), ("b", "2")):
-        told = made(capsys, tmp_path / out, f"{words} rain,{folder} --jobs {jobs}")
-        assert told["sounds"] == ["rain", "voice"]
+        told = made(capsys, tmp_path / out, f"{words} siren,gusts,{folder} --jobs {jobs}")
+        assert told["sounds"] == ["siren", "gusts", "voice"]
         audio.append((tmp_path / out / told["folders"][0] / "out_multi.wav").read_bytes())
     assert audio[0] == audio[1]
     truth = json.loads((tmp_path / "a" / told["folders"][0] / "truth.json").read_text())
+    assert truth["settings"]["signal"] == "siren"
+    assert [sound["kind"] for sound in truth["sounds"]] == ["gusts", "voice"]
     assert truth["settings"]["preset"]["sounds_folder"] == folder
     assert "one folder at most" in refusal(capsys, tmp_path / "c", f"{words} {folder},{tmp_path}")
+    assert "vuvuzela" in refusal(capsys, tmp_path / "c", f"{words} vuvuzela")
 
 
 RATE_HZ, PASS_S = 6000.0, 5.0

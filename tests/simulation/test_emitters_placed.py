@@ -1,6 +1,5 @@
 """Sounds at a place, on a vehicle and at the microphones: direction, level and coherence."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,14 +15,11 @@ from simulated_sound import (
     apart_deg,
     band_power,
     level_db,
-    made,
-    refusal,
     rendered,
     srp_spectrum,
     street_of,
 )
 
-from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.simulation import (
     SITES,
@@ -242,13 +238,3 @@ def test_drawn_sounds_have_the_requested_kinds(name, approach, kinds, seed):
     for sound in drawn.sounds:
         assert sound.start_s >= 0.0 and sound.end_s <= drawn.duration_s + 1e-9
         assert all(0 <= channel < 4 for channel in sound.channels)
-
-
-def test_the_command_adds_and_reports_sounds(tmp_path, capsys):
-    write_array_xml(tmp_path / "pair.xml", PAIR)
-    words = f"--static 1 --scene merge --duration 0.5 --array {tmp_path / 'pair.xml'} --sounds"
-    (folder,) = made(capsys, tmp_path / "d", f"{words} siren,gusts")["folders"]
-    truth = json.loads((tmp_path / "d" / folder / "truth.json").read_text())
-    assert truth["settings"]["signal"] == "siren"
-    assert [sound["kind"] for sound in truth["sounds"]] == ["gusts"]
-    assert "vuvuzela" in refusal(capsys, tmp_path / "e", f"{words} vuvuzela")

@@ -13,9 +13,7 @@ from simulated_sound import (
     OPEN,
     PAIR,
     C,
-    at,
     band_power,
-    carried,
     error_db,
     noise,
     rendered,
@@ -61,15 +59,6 @@ OPEN_NAMES = [place(name).site.name for name in PLACES]
 THROUGH_US, BENT = ((9.0, 30.0), (0.0, 0.0)), ((5.0, -20.0), (5.2, -20.0), (-40.0, 9.0))
 
 
-def test_a_moving_ego_has_the_waveform_of_its_changing_distance():
-    """The tone of a static source with its delay, level and Doppler shift."""
-    street = street_of(OPEN, ONE, 2.0, FS, EgoMotion(8.0, 10.0))
-    (found,) = carried(street, source_in(street, tone(1000.0), at(20.0, 3.0)))
-    time = np.arange(len(found)) / FS
-    distance = np.sqrt((20.0 - street.receiver.ego.x_m(time)) ** 2 + 3.0**2 + 1.4**2)
-    assert error_db(found, tone(1000.0)(time - distance / C) / distance) < -60.0
-
-
 def test_a_static_source_keeps_its_place_for_a_moving_ego():
     """Each microphone of a moving ego has the tone of its own changing distance."""
     source = np.array([6.0, 2.5, 1.7])
@@ -96,16 +85,12 @@ def test_omitted_wall_patches_have_little_energy(monkeypatch):
 
 
 # An ego that moves, vehicles that a van, a pier or a wall in the open hides, and streets of both types.
-SCENES = {
-    "moving": lambda: draw_settings("DA1", "right", np.random.default_rng(4)),
-    **{
-        name: (lambda n=name: draw_settings(n, "left", np.random.default_rng(6)))
-        for name in ("SL1", "SP1", "SM1", "SA1", "SA2", "SB1")
-    },
-}
+SCENES = {"DA1": ("right", 4), **dict.fromkeys(("SL1", "SP1", "SM1", "SA1", "SA2", "SB1"), ("left", 6))}
 
 
-def heard(scene: SimulationSettings, sound) -> np.ndarray:
+def heard(name: str, sound) -> np.ndarray:
+    approach, seed = SCENES[name]
+    scene = draw_settings(name, approach, np.random.default_rng(seed))
     street = street_of(scene.site, ONE, 10.0, FS, scene.ego, scene.preset)
     source = source_in(street, sound, lambda time: trajectories(scene, time)[0].behind(0.9), 1.0)
     add_sources(street, [source])
@@ -115,30 +100,21 @@ def heard(scene: SimulationSettings, sound) -> np.ndarray:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
-def test_paths_change_without_clicks(name):
-    """A click would spread a 500-Hz tone beyond 2 kHz."""
-    sound = heard(SCENES[name](), tone(500.0))
+def test_paths_change_without_clicks_or_steps(name):
+    """A click would spread a 500-Hz tone beyond 2 kHz; noise shows steps and gaps in windows of 50 ms."""
+    sound = heard(name, tone(500.0))
     assert np.isfinite(sound).all()
     windowed = sound * np.hanning(len(sound))
     assert band_power(windowed, FS, 2000.0) < 1e-6 * band_power(windowed, FS, -1.0)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", SCENES)
-def test_energy_on_the_way_is_continuous(name):
-    """Noise in windows of 50 ms: no step beyond what 50 ms of movement and chance make, and no gap."""
-    sound = heard(SCENES[name](), noise)
+    sound = heard(name, noise)
     power = (sound[: len(sound) // 2400 * 2400].reshape(-1, 2400) ** 2).mean(axis=1)
     # Behind a rigid wedge the level of a vehicle near the mouth rises by 20 dB within 0.3 s.
     assert np.abs(np.diff(10 * np.log10(power))).max() < 5.0
 
 
 @pytest.mark.long
-def test_truth_has_route_sight_and_time_of_every_vehicle():
-    others = (
-        VehicleSettings("right", 4.0, 9.0, kind="heavy"),
-        VehicleSettings("left", 9.0),
-    )
+def test_truth_has_the_sight_of_every_vehicle():
+    others = VehicleSettings("right", 4.0, 9.0, kind="heavy"), VehicleSettings("left", 9.0)
     drawn = draw_settings("DA2", "left", np.random.default_rng(2))
     # Mirror images cost time and do not affect the truth.
     bare = replace(drawn.site, side_order=0, facade_order=0)
@@ -146,21 +122,10 @@ def test_truth_has_route_sight_and_time_of_every_vehicle():
     recording = simulate_recording(scene, np.random.default_rng(2), PAIR)
     truth = json.loads(json.dumps(recording.truth, allow_nan=False))
     ways = [truth["frames"], *truth["others"]]
-    entries = [scene.entry_s, 4.0, 9.0]
-    assert len(ways) == 3
-    for frames, entry in zip(ways, entries, strict=True):
-        seen = [frame["line_of_sight"] for frame in frames]
-        at = seen.index(True)
-        assert abs(frames[at]["time_s"] - entry) <= 0.2
-        assert frames[at]["time_to_visible_s"] == pytest.approx(entry - frames[at]["time_s"], abs=1e-6)
-        where = np.array([frame["position_m"] for frame in frames])
-        speed = np.hypot(*np.diff(where, axis=0).T) / 0.1
-        assert speed.max() < 25.0
-    assert recording.t0_frame == min(
-        row.index(True) for row in [[f["line_of_sight"] for f in w] for w in ways]
-    )
+    first = [[frame["line_of_sight"] for frame in frames].index(True) for frames in ways]
+    np.testing.assert_allclose(0.1 * np.array(first), [scene.entry_s, 4.0, 9.0], atol=0.2)
+    assert recording.t0_frame == min(first)
     assert truth["ego"]["speed_mps"][0] == pytest.approx(scene.ego.speed_mps)
-    assert recording.detections == ()
 
 
 def test_own_noise_follows_the_speed():
@@ -347,13 +312,6 @@ def test_strong_own_wind_is_reported_as_wind(name: str, monkeypatch: pytest.Monk
     assert len(usable[0]) > 30 and all(usable[0]) and not any(usable[1])
 
 
-@pytest.mark.parametrize("later_s", [-3.0, 2.0, 7.0])
-def test_the_motion_is_the_same_on_every_clock(later_s: float) -> None:
-    ego, time = EgoMotion(6.0, 5.0), np.linspace(0.0, 9.0, 50)
-    for law in (EgoMotion.x_m, EgoMotion.at_mps):
-        np.testing.assert_allclose(law(ego.later(later_s), time), law(ego, time + later_s), atol=1e-9)
-
-
 @given(
     st.builds("{}{}{}".format, st.sampled_from("STM"), st.sampled_from("AB"), st.integers(1, 999))
     | st.sampled_from(SITES)
@@ -392,15 +350,6 @@ def carried_past(
 
 def blocks_of_noise(blocks: int, seed: int = 3) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(blocks * KNOT_SAMPLES)
-
-
-@settings(max_examples=6, deadline=None)
-@given(CARRIED, st.floats(-30.0, 30.0))
-def test_an_ego_of_speed_zero_equals_a_standing_one(name: str, y: float) -> None:
-    place = drawn_site(name).lanes_m[0], y
-    still = EgoMotion(1e-7, 9.0), STANDING
-    slow, standing = (carried_past(name, place, ego, blocks_of_noise(40)) for ego in still)
-    assert np.abs(slow - standing).max() < 1e-3 * np.abs(standing).max()
 
 
 @settings(max_examples=8, deadline=None)

@@ -116,15 +116,6 @@ def test_nearer_panels_hide_farther_ones_in_any_order():
         assert depth == pytest.approx(3.567, abs=1e-3)
 
 
-def test_a_patch_contains_the_projection():
-    points = np.array([[6.0, 1.0, -1.7], [7.0, -1.0, -0.2]])
-    patch = View(SMALL).around(points)
-    pixels = opencv_pixels(SMALL, points)
-    assert patch.left <= 2 * pixels[:, 0].min() <= patch.left + 2
-    assert patch.right - 2 <= 2 * pixels[:, 0].max() <= patch.right
-    assert View(SMALL).around(np.array([[5.0, 40.0, -1.0]])) is None
-
-
 def test_a_car_fills_the_projection_of_its_cuboid():
     """The bounding box of its colour in the open against the projected corners by OpenCV."""
     street = paint_street(site("SB1"), View(MIDDLE))

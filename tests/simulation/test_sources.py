@@ -135,13 +135,16 @@ def test_engine_speed_follows_gears_within_five_per_cent(speed, braking, seed):
     assert np.abs(np.diff(np.log(firing))).max() < 0.01  # no jumps
 
 
-@given(st.floats(0.0, 20.0), st.floats(0.0, 60.0))
-def test_ego_speed_is_the_derivative_of_its_position(speed, stop):
+@given(st.floats(0.0, 20.0), st.floats(0.0, 60.0), st.sampled_from([-3.0, 2.0, 7.0]))
+def test_ego_speed_is_the_derivative_of_its_position_on_any_clock(speed, stop, later_s):
     ego, time = EgoMotion(speed, stop), np.linspace(-5.0, 70.0, 20_001)
     x, v = ego.x_m(time), ego.at_mps(time)
     np.testing.assert_allclose(np.diff(x) / np.diff(time), 0.5 * (v[1:] + v[:-1]), atol=0.01)
     assert np.all(np.diff(v) >= -1.01 * BRAKING_MPS2 * (time[1] - time[0]))
     assert x[-1] == 0.0 == v[-1]
+    later, from_zero = ego.later(later_s), time[time >= 0.0]
+    for law in (EgoMotion.x_m, EgoMotion.at_mps):
+        np.testing.assert_allclose(law(later, from_zero), law(ego, from_zero + later_s), atol=1e-9)
 
 
 points = st.floats(-20.0, 20.0)
