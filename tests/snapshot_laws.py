@@ -79,6 +79,8 @@ def _advisories(state: WorldState) -> Iterator[str]:
             yield where + f"an advisory until {told.valid_until_ns} at {state.stamp_ns}"
         if told is not None and told.since_ns > state.stamp_ns:
             yield where + f"an advisory since {told.since_ns} at {state.stamp_ns}"
+        if told is not None and not {one.sensor for one in told.sensors} <= {s.sensor for s in state.sensors}:
+            yield where + f"an advisory of sensors that the snapshot does not list: {told.sensors}"
         if cue.held is not None and (told is None or cue.held.until_ns != told.valid_until_ns):
             yield where + f"held {cue.held}, advisory {told}"
 

@@ -21,7 +21,7 @@ from street_measurements import (
     run,
 )
 
-from worldstate import Context, Measurement, Sighting, WorldFilter, WorldState
+from worldstate import Context, Measurement, Sighting, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.road_users import Foreign
 from worldstate.abduction.sequence.sequence_model import COMING_S
@@ -53,33 +53,6 @@ def passing(begin: int, end: int, *nats: tuple[float, ...], turns: float, hops: 
         boxes = [car(0.55 - turns * (number - begin))] if begin <= number < end else []
         told.append(hop(number, nats[number >= begin], *boxes, answer=PRESENT if boxes else ABSENT))
     return told
-
-
-@given(SEEDS, st.booleans())
-@settings(max_examples=2)
-def test_an_advisory_has_its_onset_and_ends_at_its_expiry(seed: int, sequence: bool) -> None:
-    worlds = run(WorldFilter(), script(seed, 20, sequence))
-    since: dict[str, int] = {}
-    for before, world in zip([None, *worlds], worlds, strict=False):
-        for cue in world.state.cues:
-            told = cue.advisory
-            ended = before is None or not _named(before.predict_to(world.stamp_ns).state, cue.direction)
-            if told is None:
-                since.pop(cue.direction, None)
-                continue
-            begun = since.get(cue.direction) if not ended else None
-            since[cue.direction] = world.stamp_ns if begun is None else begun
-            assert told.since_ns == since[cue.direction] <= world.stamp_ns <= told.valid_until_ns
-            assert told.valid_until_ns - world.stamp_ns <= 1.005e9
-            assert {one.sensor for one in told.sensors} <= {one.sensor for one in world.state.sensors}
-            if sequence:  # Only time ends an advisory of a sequence; the window rule takes the likelier side
-                assert _named(world.predict_to(told.valid_until_ns).state, cue.direction)
-            assert not _named(world.predict_to(told.valid_until_ns + 1).state, cue.direction)
-    assert since or not any(cue.advisory for cue in worlds[-1].state.cues)
-
-
-def _named(state: WorldState, side: str) -> bool:
-    return any(cue.advisory is not None for cue in state.cues if cue.direction == side)
 
 
 @given(SEEDS, st.floats(0.01, 0.9))
@@ -201,31 +174,6 @@ def test_a_high_risk_without_sound_has_its_reason() -> None:
     assert silent.not_advised == "nothing was measured for a second"
 
 
-@given(SEEDS, st.booleans())
-@settings(max_examples=3)
-def test_events_account_for_every_entity(seed: int, sequence: bool) -> None:
-    alive: dict[str, str] = {}
-    kinds = set()
-    for world in run(WorldFilter(), script(seed, 40, sequence)):
-        for event in world.state.events:
-            kinds.add(event.kind)
-            assert event.stamp_ns == world.stamp_ns
-            assert (event.kind == "born") == (event.entity_id not in alive)
-            if event.kind == "handed_over":
-                assert alive[event.entity_id] != "visible"
-            alive[event.entity_id] = event.kind
-            assert (event.kind == "merged") == (event.into is not None)
-            if event.kind in ("died", "merged"):
-                del alive[event.entity_id]
-        now = {one.id: one.status for one in world.state.entities}
-        assert set(now) == set(alive)
-        for name, status in now.items():
-            seen_now = alive[name] == "handed_over"
-            assert not seen_now or status == "visible"
-            alive[name] = status
-    assert {"born", "handed_over", "coasting", "died"} <= kinds
-
-
 def test_a_snapshot_holds_no_more_than_64_events() -> None:
     many = tuple(Position((5.0 + one, 0.0), ((0.01, 0.0), (0.0, 0.01))) for one in range(100))
     state = WorldFilter().update(PositionScan("lidar", 10**9, many)).state
@@ -282,15 +230,6 @@ def test_a_double_detection_becomes_one_entity_and_two_cars_stay_two(twice: rang
     boxes = [(car(0.1), car(0.13)) if number in twice else (car(0.13),) for number in range(1, 40)]
     told = (hop(number, (-1.0,) * 4, *seen, answer=Present(0.3)) for number, seen in enumerate(boxes, 1))
     assert len(after(*told).state.entities) == entities
-
-
-def test_a_vehicle_of_both_sides_is_one_entity_at_the_hand_over() -> None:
-    both, none = (4.0, 4.0, 0.0, 0.0), (-4.0, -4.0, 0.0, 0.0)
-    *_, world = worlds = run(WorldFilter(), passing(30, 60, both, none, turns=0.03, hops=60))
-    told = [one for world in worlds for one in world.state.events]
-    (found,) = (one for one in told if one.kind == "handed_over")
-    assert [one.id for one in world.state.entities] == [found.entity_id]
-    assert [one.kind for one in told] == ["born", "handed_over"]
 
 
 def test_a_relation_has_its_start_and_end() -> None:

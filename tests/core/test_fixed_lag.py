@@ -73,6 +73,8 @@ def test_events_explain_changes_between_snapshots_with_late_data(seed: int) -> N
             {one.id: one.status == "visible" for one in many} for many in (before, world.state.entities)
         )
         kinds = {event.entity_id: event.kind for event in world.state.events}
+        assert all(event.stamp_ns == world.stamp_ns for event in world.state.events)
+        assert all((event.kind == "merged") == (event.into is not None) for event in world.state.events)
         counted |= set(kinds.values()) if world.state.delivery.replayed else set()
         for name in was.keys() | now.keys() | kinds.keys():
             if name not in was or name not in now:
