@@ -86,7 +86,9 @@ def measurement(rng: np.random.Generator, stamp_ns: int) -> Measurement:
     taken_ns = stamp_ns - int(rng.integers(0, SECOND_NS))
     look = None if isinstance(said, Unqueried) or rng.random() < 0.5 else Look("camera", taken_ns, said)
     boxes = int(rng.integers(0, 6)) if rng.random() < 0.4 else 0
-    cameras = [Look(name, taken_ns, answer(rng), (-0.1, 1.5)) for name in ("left", "right")]
+    looks = [Look(name, taken_ns, answer(rng), (-0.1, 1.5)) for name in ("left", "right")]
+    seen = (tuple(sighting(rng) for _ in range(rng.integers(3))) for _ in looks)
+    further = tuple(map(CameraLook, looks, seen)) if rng.random() < 0.2 else ()
     reason, kinds = str(rng.choice(["wind", "clipped"])), {"car": extreme(rng, 0.0, 1.0)}
     heard = Heard(extreme(rng, 0.0, 1.0), reason, kinds=kinds) if rng.random() < 0.3 else Heard()
     level = float(rng.normal())
@@ -103,7 +105,7 @@ def measurement(rng: np.random.Generator, stamp_ns: int) -> Measurement:
         sequence=(reading(rng), reading(rng), SILENT, None)[int(rng.integers(0, 4))],
         domain=domain,
         source=str(rng.choice(["acoustic", "v2x", "radar"])),
-        further=tuple(map(CameraLook, cameras)) if rng.random() < 0.2 else (),
+        further=further,
         heard=heard,
     )
 

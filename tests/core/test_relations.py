@@ -1,7 +1,6 @@
 """Relations: same lane, in front of, conflict with the path of the ego vehicle, occlusion."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -88,25 +87,6 @@ def test_a_message_behind_a_corner_approaches_from_its_arm() -> None:
         return next((r.probability for r in relations if r.kind == "approaching_from"), 0.0)
 
     assert arm(-6.0) > 0.9 and arm(6.0) < 0.1
-
-
-def test_relations_refer_only_to_entities_of_the_snapshot() -> None:
-    """In 500 steps vehicles of two lanes appear and leave, some of them hidden."""
-    rng, world, ended, named = np.random.default_rng(3), WorldFilter(), 0, 0
-    there = list[np.ndarray]()
-    for step in range(1, 501):
-        there = [one + 0.1 * np.append(one[2:], (0.0, 0.0)) for one in there if rng.random() < 0.97]
-        if len(there) < 5 and rng.random() < 0.3:
-            lane = (10.0, rng.uniform(5.0, 25.0), 0.0, -6.0), (rng.uniform(5.0, 40.0), 0.5, 5.0, 0.0)
-            there.append(np.array(lane[int(rng.integers(2))]))
-        found = [Position(tuple(one[:2]), SPREAD, tuple(one[2:]), 0.9) for one in there if rng.random() < 0.9]
-        scan = PositionScan("radar", step * 10**8, tuple(found), ALL_ROUND)
-        world = world.update(scan if rng.random() < 0.8 else replace(scan, source="v2x", searched=None))
-        state = (world if rng.random() < 0.8 else world.predict(rng.uniform(0.0, 1.0))).state
-        assert not broken_laws(state), step
-        ended += sum(one.until_ns is not None for one in state.relations)
-        named += len(state.relations)
-    assert named > 2_500 and ended > 250
 
 
 # Law 17: an occluder hides an object behind it, whichever sensor found it.
