@@ -1,9 +1,8 @@
-"""The joint belief of all sides: laws over random inputs, against enumeration and gtsam."""
+"""The joint belief of all sides: laws over random inputs, against enumeration."""
 
 import itertools
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -98,36 +97,6 @@ def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
     )
 
 
-@given(SEEDS)
-@settings(max_examples=1, deadline=None)
-def test_the_belief_equals_a_factor_graph(seed: int) -> None:
-    """Oracle: gtsam's discrete factor graph of two sides over three steps, eliminated."""
-    rng = np.random.default_rng(seed)
-    prior, told = prior_of(rng, 2), [likelihoods(rng, 2) for _ in range(2)]
-    sizes = (STATES, STATES, 2)
-
-    def table(values: FloatArray) -> str:
-        return " ".join(repr(float(value)) for value in values.ravel())
-
-    keys = [[(10 * step + axis, sizes[axis]) for axis in range(3)] for step in range(3)]
-    graph, belief = gtsam.DiscreteFactorGraph(), JointBelief(prior.weights)
-    for axis, side in enumerate([one.states for one in prior.sides]):
-        graph.add([keys[0][axis]], table(side))
-    graph.add([keys[0][2]], table(np.array([1.0 - prior.elsewhere, prior.elsewhere])))
-    for step, likelihood in enumerate(told, 1):
-        for axis, chain in enumerate(chains(prior, STREET, 10**8)):
-            graph.add([keys[step - 1][axis], keys[step][axis]], table(chain))
-        states = np.array([likelihood[part_of(one)] for one in every_state(2)])
-        graph.add(keys[step], table(states))
-        belief = belief.carried(prior, STREET, 10**8).told(likelihood)
-    marginals = gtsam.DiscreteMarginals(graph)
-    for axis in range(3):
-        others = tuple(k for k in range(3) if k != axis)
-        np.testing.assert_allclose(
-            belief.weights.sum(axis=others), marginals.marginalProbabilities(keys[2][axis]), atol=1e-9
-        )
-
-
 @given(SEEDS, st.sampled_from([1, 2]))
 def test_a_distant_vehicle_on_several_sides_counts_once(seed: int, sides: int) -> None:
     """Counted per side, a distant vehicle made an existing one from nothing.
@@ -146,23 +115,6 @@ def test_a_distant_vehicle_on_several_sides_counts_once(seed: int, sides: int) -
     for k in range(sides):
         others = tuple(j for j in range(sides + 1) if j != k)
         assert joint.sum(axis=others)[NONE + 1] == pytest.approx(far[k], abs=1e-9)
-
-
-@given(SEEDS)
-@settings(max_examples=5, deadline=None)
-def test_a_reading_alone_replaces_the_belief(seed: int) -> None:
-    """The reading takes full effect, to 1e-9, and each side has its own probabilities."""
-    rng = np.random.default_rng(seed)
-    prior = prior_of(rng, 2)
-    belief = JointBelief(prior.weights)
-    for step_ns in rng.integers(5 * 10**7, 2 * 10**9, 5).tolist():
-        groups = drawn_groups(rng, 2, least=0.01)
-        groups[:, GROUPS.index("none")] += 1.0  # Otherwise the sides would be inconsistent
-        groups /= groups.sum(axis=1, keepdims=True)
-        reading = joint_reading(groups, 0.2, STREET.by_sound)
-        belief = belief.carried(prior, STREET, step_ns).read("ear", reading, prior, (0, 1))
-        np.testing.assert_allclose(belief.by_part, reading, atol=1e-9)
-        np.testing.assert_allclose(belief.hidden[:, FIRST_BIN:], groups[:, :COMING], atol=1e-9)
 
 
 @given(SEEDS)
