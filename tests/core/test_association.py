@@ -169,13 +169,3 @@ def test_a_leaving_vehicle_does_not_take_the_identity_of_a_coming_one(sign, azim
     world = after(*(looked(number, nats, *one) for number, one in enumerate(boxes, 30)), world=world)
     (seen,) = (one for one in world.state.entities if one.last_seen_ns == 4e9)
     assert (seen.id != name) == leaves
-
-
-def test_an_ambiguous_box_lowers_the_existence_of_neither_vehicle():
-    """Two cars are a degree apart with one box between them; a missed look would lower both."""
-    both = car(0.0, 0.03), car(0.02, 0.03)
-    world = after(*(looked(number, (0.0, 0.0), *both) for number in range(1, 8)))
-    left = world.update(looked(10, (0.0, 0.0), car(0.01, 0.03))).state.entities
-    assert len(left) == 2 and all(one.existence_probability > 0.5 for one in left)
-    gone = world.update(looked(10, (0.0, 0.0))).state.entities
-    assert all(one.existence_probability < 0.9 * left[0].existence_probability for one in gone)

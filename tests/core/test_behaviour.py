@@ -115,15 +115,6 @@ def test_the_likelihood_ratio_handles_priors_of_zero():
     assert log_lambda(one_sided, heard, UNASKED) == pytest.approx(1.0 - other)
 
 
-def test_absurd_approach_rates_do_not_end_the_filter():
-    """Three receding rates within the accepted range once made exp(log r) overflow."""
-    absurd = [hop(20 + t, LEFT, approach=Approach(-1e3, 1e-3)) for t in range(1, 4)]
-    world = after(hop(10, LEFT), hop(20, LEFT), *absurd).predict(1.0)
-    (entity,) = world.state.entities
-    assert math.isfinite(entity.azimuth_rad)
-    assert math.isfinite(entity.inverse_tta_hz)
-
-
 def test_a_certain_entity_survives_a_checkpoint():
     """Rounding must not make a probability exceed one, because such a checkpoint raises an error."""
     world, rng = WorldFilter(), np.random.default_rng(0)

@@ -142,25 +142,6 @@ def test_a_hidden_azimuth_includes_the_possible_bias():
     assert world.state.cues[0].azimuth_std_rad == pytest.approx(math.hypot(spread, math.radians(10.0)))
 
 
-def test_sound_from_before_a_hand_over_makes_no_new_entity():
-    off = Unqueried("sector out of view")
-    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
-    script += [measured(t, LEFT, car(0.5), answer=off) for t in hops(4.0, 4.9)]
-    _, states = run(start(), script)
-    assert any(cue.advisory for cue in states[-10].cues)
-    assert not any(cue.advisory for cue in states[-1].cues)
-    assert [e.status for e in states[-1].entities] == ["visible"]
-
-
-def test_the_side_comes_from_the_signature_and_not_from_the_peak():
-    """Most peaks of a hidden vehicle are reflections in the walls of the other side."""
-    wrong = Bearing(-0.9, 0.06, 1.4)
-    world, _ = run(start(), [measured(t, LEFT, bearing=wrong) for t in hops(1.0, 4.0)])
-    (entity,) = world.state.entities
-    assert entity.direction == "left"
-    assert entity.azimuth_rad > 0.5
-
-
 def test_without_a_camera_an_entity_emerges():
     """Without a camera one entity is hidden, then emerged, and never visible."""
     off = Unqueried("no detections")
@@ -209,16 +190,6 @@ def test_two_hidden_vehicles_hand_over_to_their_own_sides():
     assert {("left" if e.azimuth_rad > 0 else "right"): e.id for e in seen} == before
 
 
-def test_a_missed_image_after_a_hand_over_is_no_new_hazard():
-    """The window still holds the sound from before the hand-over, so it does not change the belief."""
-    script = [measured(t, LEFT) for t in hops(1.0, 3.0)] + [measured(3.0, LEFT, car(0.5))]
-    world, _ = run(start(), script)
-    missed, quiet = (world.update(measured(3.1, one, answer=Absent(0.1))) for one in (LEFT, QUIET))
-    assert missed.belief == quiet.belief
-    for one in (world, missed):
-        assert one.belief.hypotheses[1] > 2.0 / 3.0 > 1.0 / 3.0 > one.belief.hypotheses[0]
-
-
 def test_a_faint_belief_is_not_handed_over():
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, SILENCE) for t in hops(4.0, 7.0)]
     settings_ = FilterSettings(street=StreetModel(death=1e-3))
@@ -227,16 +198,6 @@ def test_a_faint_belief_is_not_handed_over():
     assert faint.existence_probability < 0.02
     world = world.update(measured(7.0, SILENCE, car(-0.5)))
     assert {e.status: e.id == faint.id for e in world.state.entities}["visible"] is False
-
-
-def test_a_false_alarm_dies():
-    script = [measured(t, QUIET) for t in hops(1.0, 2.0)]
-    script += [measured(t, LEFT) for t in hops(2.0, 2.5)]
-    script += [measured(t, QUIET) for t in hops(2.5, 6.0)]
-    _, states = run(start(), script)
-    assert any(s.entities for s in states)
-    assert states[-1].entities == ()
-    assert states[-1].risk < 0.1
 
 
 def test_hysteresis_keeps_one_id_through_a_dip():
@@ -352,14 +313,6 @@ def test_a_hidden_entity_stays_on_its_side_for_any_looming(rates, azimuth):
     hidden = [e for s in states for e in s.entities]
     assert hidden
     assert all(0.2 < e.azimuth_rad < 1.7 and 0.17 < e.azimuth_std_rad < 0.8 for e in hidden)
-
-
-def test_without_measurements_a_hidden_entity_fades_on_its_side():
-    world, _ = run(start(), [measured(t, LEFT, approach=Approach(0.8, 0.2)) for t in hops(1.0, 4.0)])
-    before = world.state.entities[0].existence_probability
-    (entity,) = world.predict(3.0).state.entities
-    assert entity.hidden_probability < before
-    assert entity.azimuth_rad > 0.3
 
 
 @given(st.floats(0.02, 0.49), st.floats(0.51, 0.98), st.sampled_from([Unqueried("-"), Absent(0.2)]))

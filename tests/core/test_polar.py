@@ -7,7 +7,6 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scipy.stats import chi2
 
 from worldstate.belief.kinematics.motion import (
     AZIMUTH,
@@ -132,33 +131,6 @@ def test_relaxation_may_leave_the_bearing_alone():
     assert after.mean == pytest.approx([*belief.mean[:2], *PRIOR.mean[2:]])
     assert after.covariance[:2, :2] == pytest.approx(belief.covariance[:2, :2])
     assert after.covariance[2:, 2:] == pytest.approx(PRIOR.covariance[2:, 2:])
-
-
-def mean_nees(runs, seed, steps=30):
-    """Normalised estimation error squared over runs drawn from the prior; bearing 4 deg, looming 0.25 1/s."""
-    rng = np.random.default_rng(seed)
-    std = (0.35, 0.1, 0.1, 0.3)
-    start = (0.9, 0.0, -0.12, 3.4)
-    nees = []
-    for _ in range(runs):
-        truth, belief = rng.normal(start, std), MotionBelief.around(start, std)
-        for _ in range(steps):
-            noise = process_noise(0.5, np.exp(truth[3]), 0.1)
-            truth = propagate(truth, 0.1)[0] + rng.multivariate_normal(np.zeros(4), noise)
-            belief = predict(belief, 0.1, 0.5)
-            azimuth = math.remainder(truth[0] + rng.normal(0, 0.07), 2 * math.pi)
-            belief = update(belief, AZIMUTH, azimuth, 0.07, 1.0)
-            belief = update(belief, RADIAL_RATE, truth[2] - rng.normal(0, 0.25), 0.25, 1.0)
-        error = wrapped(truth - belief.mean)
-        nees.append(error @ np.linalg.solve(belief.covariance, error))
-    return float(np.mean(nees))
-
-
-def test_the_nees_matches_the_covariance():
-    """Mean NEES of 80 runs within the 99.9 % band of chi-square with four degrees of freedom."""
-    runs = 80
-    low, high = chi2.ppf([0.0005, 0.9995], 4 * runs) / runs
-    assert low < mean_nees(runs, seed=3) < high
 
 
 def engine(belief):
