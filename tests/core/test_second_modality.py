@@ -45,23 +45,14 @@ def test_a_beacon_is_hidden_then_visible_with_the_same_id(v2x):
 
 
 def test_a_forged_visible_beacon_is_refuted_by_the_camera(v2x):
-    """Claim and power fit a visible car; only the missing detection contradicts them.
-
-    The evidence depends on whether the camera works: repeated claims make a broken camera likelier.
-    """
+    """Claim and power fit a visible car; only the missing detection contradicts them."""
     signature = v2x.RadioSignature()
     plain = v2x.Beacon(0, 20.0, 0.0, -5.0, 0.0, signature.transmit_dbm - signature.loss_at_1_m_db - 26.0)
     forged = [replace(plain, stamp_ns=nanoseconds(i / 10)) for i in range(1, 11)]
     camera, works = v2x.ScriptedCamera([], t0_s=0.0), StreetModel(works=1.0, fails_s=1e6)
     refuted = last(v2x.run(forged, camera, replace(v2x.SETTINGS, street=works)))
-    believed = last(v2x.run(forged, None))
-    doubted = last(v2x.run(forged, camera))
     assert refuted.cues[0].hypotheses.none > 0.9
-    assert believed.cues[0].hypotheses.visible > 0.9
-    assert refuted.cues[0].hypotheses.none > doubted.cues[0].hypotheses.none > 0.1
-    # A camera that misses 99 % does not refute the claim.
-    blind = last(v2x.run(forged, v2x.ScriptedCamera([], t0_s=0.0, miss_rate=0.99)))
-    assert blind.cues[0].hypotheses.visible > 0.9
+    assert last(v2x.run(forged, None)).cues[0].hypotheses.visible > 0.9
 
 
 def test_a_beacon_of_implausible_power_makes_no_entity(v2x):

@@ -87,14 +87,6 @@ def test_forgetting_reduces_weights_and_keeps_means():
         assert after.edge.std_rad > before.edge.std_rad
 
 
-def test_forgetting_in_two_steps_equals_one_step():
-    street = watched(street_of(6), 600.0)
-    twice, once = forgotten(forgotten(street, 2.0 * DAY_S), 3.0 * DAY_S), forgotten(street, 5.0 * DAY_S)
-    for before, after in zip(twice.arms, once.arms, strict=True):
-        assert before.arrivals == pytest.approx(after.arrivals)
-        assert before.exposure_s == pytest.approx(after.exposure_s)
-
-
 def test_a_filter_keeps_a_learned_street_with_the_usual_rates_in_its_checkpoint():
     world = WorldFilter(context_of(street_of(10))).predict(0.3)
     assert world.context.rates == Rates()
