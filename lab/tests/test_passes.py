@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hop_tables import heard_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, lfilter, sosfilt
@@ -53,7 +54,6 @@ from worldstate.commissioning.heard_stream import (
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.operations.metrics.approach_table import Figures
-from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.state import SideShare
 
@@ -69,33 +69,22 @@ def stream(
     """Return vehicles that cross the street ahead, visible between the corners, or come along the ego's
     own."""
     loud_db = band_db or [60.0] * len(vehicles)
-    rows, edge_m = [], STREET_M * math.tan(CORNER_RAD)
+    told, rows, edge_m = [], [], STREET_M * math.tan(CORNER_RAD)
     for number, (flow, arm, entry_s) in enumerate(vehicles):
+        told.append((number, flow, "light", arm, entry_s, flow != "from_ahead"))
         for time_s in np.round(np.arange(max(entry_s - 8.0, 0.0), entry_s + 4.0, 0.1), 1):
             x_m, y_m = STREET_M, (1.0 if arm == "left" else -1.0) * (edge_m - PACE_MPS * (time_s - entry_s))
             if flow == "from_ahead":
                 x_m, y_m = 22.0 - 4.0 * (time_s - entry_s), 0.5
             seen = bool(time_s > entry_s and abs(y_m) <= edge_m and x_m > 4.0)
             rows.append((number, time_s, x_m, y_m, seen, loud_db[number]))
-    flow, arm, entry_s = zip(*vehicles, strict=True)
-    told = {
-        "vehicle": np.arange(len(vehicles)),
-        "flow": np.array(flow, np.str_),
-        "kind": np.array(["light"] * len(vehicles), np.str_),
-        "arm": np.array(arm, np.str_),
-        "entry_s": np.array(entry_s, np.float64),
-        "hazard": np.array([one != "from_ahead" for one in flow]),
-    }
-    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "band_db")
-    columns = dict(zip(names, (np.array(column) for column in zip(*rows, strict=True)), strict=True))
     time_s = np.round(np.arange(1.0, duration_s, 0.1), 1)
     # White noise of one pascal has 94 dB: this gives 40 dB of background, of which the 1.7-kHz band has five
     # ninths.
     middle = np.random.default_rng(4).normal(0.0, STEP_40_DB, (len(time_s), 600)).round().astype(np.int16)
-    about = {"site": "SB2", "sample_rate_hz": 6000.0}
-    hops = HopTable({"time_s": time_s, "middle": middle}, about=about)
-    columns["loudness_db"] = columns["band_db"]
-    return HeardStream(hops, HopTable(told), HopTable(columns))
+    hops = {"time_s": time_s, "middle": middle}
+    found = heard_stream(told, rows, hops, site="SB2", sample_rate_hz=6000.0)
+    return replace(found, rows=found.rows.replace(band_db=found.rows.loudness_db))
 
 
 def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
@@ -325,16 +314,6 @@ def test_the_guard_acts_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
         assert other.heard == beside_foreign(other.domain, one.heard)
 
 
-def test_boxes_are_at_the_true_positions_of_vehicles_in_view() -> None:
-    made_up = stream([("left", "left", 12.0)])
-    log = stream_detections(made_up, np.random.default_rng(1))
-    boxed_s = log.stamps_ns[[len(frame) > 0 for frame in log.frames]] * 1e-9
-    assert 12.0 < boxed_s[0] < 12.6 and boxed_s[-1] < 15.0 and boxed_s.size > 15
-    middles = [np.mean(frame.boxes_px[0, [0, 2]]) for frame in log.frames if len(frame)]
-    # It crosses from the left to the right of the image.
-    assert middles[0] < 600 and middles[-1] > 1300
-
-
 @given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.2))
 @settings(max_examples=10)
 def test_a_hidden_bearing_is_behind_the_edge_and_is_mirrored(seed: int, edge_rad: float) -> None:
@@ -375,7 +354,7 @@ def test_no_estimate_costs_half_the_cutoff_and_trackers_follow_the_boxes() -> No
     np.testing.assert_allclose(per_hop[bench.SILENCE], [[0.0, 30.0, 0.0]] * 2, atol=1e-9)
     hidden, visible = per_hop[bench.WORLD].sum(axis=1)
     assert hidden < 15.0 and visible < 15.0
-    for tracker in (bench.UNHEARING, bench.OC_SORT, bench.GM_PHD, bench.GM_PHD_ENDS, bench.JPDA):
+    for tracker in (bench.UNHEARING, bench.OC_SORT, bench.GM_PHD, bench.JPDA):
         hidden, visible = per_hop[tracker].sum(axis=1)
         # Without sound, no method detects a vehicle before its first box; with boxes, every method tracks it.
         assert hidden >= 29.0 and visible < 20.0 and per_hop[tracker][1, 0] < 10.0

@@ -5,6 +5,7 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
+from hop_tables import heard_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
@@ -29,10 +30,8 @@ from worldstate_lab.planner.planner_exam import (
     unseen_from_m,
 )
 
-from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.metrics.approach_table import share_interval
-from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.simulation.scene.junction import site
 
 PACE_MPS, ENTRY_Y_M, ENTRIES_S = 4.5, 4.0, (40.0, 80.0, 120.0, 160.0)
@@ -41,31 +40,18 @@ PACE_MPS, ENTRY_Y_M, ENTRIES_S = 4.5, 4.0, (40.0, 80.0, 120.0, 160.0)
 def stream(name: str = "SB2", entries_s: tuple[float, ...] = ENTRIES_S, known: bool = True) -> BelievedStream:
     """Return vehicles alternately from the left and the right, with a chance of one in the 3 s before each
     T0."""
-    rows, near_m = [], site(name).lanes_m
-    for number, entry_s in enumerate(entries_s):
-        side = number % 2
-        for time_s in np.round(np.arange(entry_s - 8.0, entry_s + 5.0, 0.1), 1):
-            way_m = ENTRY_Y_M - PACE_MPS * (time_s - entry_s)
-            rows.append((number, time_s, near_m[side], (1 - 2 * side) * way_m, abs(way_m) <= ENTRY_Y_M, 60.0))
+    told, rows, lanes_m = [], [], site(name).lanes_m
     time_s = np.round(np.arange(1.0, 220.0, 0.1), 1)
     chances = np.zeros((len(time_s), 2, 4), np.float32)
-    for number, entry_s in enumerate(entries_s if known else ()):
-        chances[(time_s > entry_s - 3.0) & (time_s < entry_s), number % 2] = 1.0
-    n, names = len(entries_s), ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
-    kinds = ["light"] * (n - n // 4) + ["bicycle"] * (n // 4)
-    told = {
-        "vehicle": np.arange(n),
-        "flow": np.array(["left"] * n, np.str_),
-        "kind": np.array(kinds, np.str_),
-        "arm": np.array(["left", "right"] * n, np.str_)[:n],
-        "entry_s": np.array(entries_s),
-        "hazard": np.ones(n, bool),
-    }
-    table = HopTable({"time_s": time_s}, about={"site": name})
-    columns = dict(zip(names, np.array(rows).reshape(-1, 6).T, strict=True))
-    columns["in_view"] = columns["in_view"].astype(bool)
-    heard = HeardStream(table, HopTable(told), HopTable(columns))
-    return with_chances(heard, time_s, chances)
+    for number, entry_s in enumerate(entries_s):
+        side, kind = number % 2, "bicycle" if number == 3 else "light"
+        told.append((number, "left", kind, ("left", "right")[side], entry_s, True))
+        for moment_s in np.round(np.arange(entry_s - 8.0, entry_s + 5.0, 0.1), 1):
+            way_m = ENTRY_Y_M - PACE_MPS * (moment_s - entry_s)
+            in_view = abs(way_m) <= ENTRY_Y_M
+            rows.append((number, moment_s, lanes_m[side], (1 - 2 * side) * way_m, in_view, 60.0))
+        chances[(time_s > entry_s - 3.0) & (time_s < entry_s), side] = known
+    return with_chances(heard_stream(told, rows, {"time_s": time_s}, site=name), time_s, chances)
 
 
 EVERY = (stream(), stream("SA1"), stream(entries_s=()))

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from hop_tables import heard_stream
 from worldstate_lab.sequences.summed_scores import OTHERS, LevelReading, summed_scores
 from worldstate_lab.trials.trial import Trial
 
 from worldstate.abduction.sequence.sequence_inputs import COLUMNS, sequence_inputs
 from worldstate.adapters.files.model_file import read_model
 from worldstate.commissioning.commission import parts_of, stream_evidence
-from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import stream_truth
 from worldstate.operations.recordings.hop_table import HopTable
 
@@ -35,15 +35,8 @@ def stream(vehicles, seed, duration_s=75.0):
         "looming_std_hz": np.full(len(time_s), np.nan),
         "bearing_rad": bearing + 0.05 * rng.normal(size=len(time_s)),
     }
-    told = {
-        "vehicle": np.arange(len(vehicles)),
-        "arm": np.array([arm for arm, _ in vehicles], np.str_),
-        "entry_s": np.array([t0_s for _, t0_s in vehicles], float),
-        "hazard": np.ones(len(vehicles), bool),
-    }
-    names = ("vehicle", "time_s", "x_m", "y_m", "in_view", "loudness_db")
-    about = {"site": "SA101"}
-    return HeardStream(HopTable(hops, about=about), HopTable(told), HopTable.of_rows(names, rows))
+    told = [(number, arm, "light", arm, t0_s, True) for number, (arm, t0_s) in enumerate(vehicles)]
+    return heard_stream(told, rows, hops, site="SA101")
 
 
 @pytest.fixture(scope="module")
