@@ -1,6 +1,5 @@
 """A small pass over sound files, kept in a cache, for tests that send it to other processes."""
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,6 @@ class Levels:
     `log`."""
 
     folder: Path  # Folder of the cache
-    pause_s: float = 0.0  # Simulated duration
 
     def __call__(self, path):
         mark = fingerprint(path, self.folder / "fingerprints")
@@ -26,9 +24,8 @@ class Levels:
         return tables["hops"]
 
     def make(self, path):
-        with (self.folder.parent / "log").open("a") as log:
+        with (self.folder / "log").open("a") as log:
             log.write(f"{path.name}\n")
-        time.sleep(self.pause_s)
         try:
             sound, rate_hz = soundfile.read(path)
         except soundfile.LibsndfileError as error:
@@ -37,13 +34,3 @@ class Levels:
         # Products of this size are distributed over BLAS threads if more than one may run.
         gram = np.array([second.T @ second for second in seconds])
         return HopTable({"gram": gram, "level": np.sqrt(np.mean(seconds**2, (1, 2)))}, path.name)
-
-
-def write_sounds(folder, n, seconds=2):
-    """Write this many files of noise."""
-    folder.mkdir(exist_ok=True)
-    rng = np.random.default_rng(1)
-    paths = [folder / f"{i}.wav" for i in range(n)]
-    for path in paths:
-        soundfile.write(path, rng.uniform(-0.5, 0.5, (seconds * 8000, 16)), 8000, "PCM_24")
-    return paths

@@ -1,4 +1,4 @@
-"""Results of passes over recordings: cached as a whole, by content, and computed again if damaged."""
+"""Results of passes over recordings: cached by content, and the same on any number of processes."""
 
 import os
 from dataclasses import replace
@@ -6,11 +6,13 @@ from dataclasses import replace
 import hypothesis.extra.numpy as npst
 import numpy as np
 import pytest
+import soundfile
+from attempt_work import Levels
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worldstate_lab.trials import pass_cache
 from worldstate_lab.trials.classification import windows_origin
-from worldstate_lab.trials.pass_cache import PassCache, fingerprint
+from worldstate_lab.trials.pass_cache import Failed, PassCache, attempted, fingerprint
 
 from worldstate.adapters.datasets.feature_extraction import LabelledWindow
 from worldstate.frontend.array.microphone_array import ovad_array
@@ -126,6 +128,9 @@ def test_damaged_or_exchanged_tables_are_computed_again_with_a_warning(tmp_path)
         with pytest.warns(UserWarning, match="computed again"):
             assert_same(cache.tables("sound", 1, some_tables), some_tables())
         assert_same(cache.tables("sound", 1, never), some_tables())
+    mine.with_suffix(".sum").unlink()  # As if a run had been killed between the two files
+    with pytest.raises(AssertionError):
+        cache.tables("sound", 1, never)
 
 
 def test_windows_are_identified_by_their_sound_and_not_by_its_path(tmp_path):
@@ -156,3 +161,34 @@ def test_a_sound_file_has_a_fingerprint_and_a_missing_one_has_none(tmp_path):
     assert len(fingerprint(tmp_path / "a.wav", memo)) == 32
     with pytest.raises(InputFileError, match=r"out_multi\.wav"):
         fingerprint(tmp_path, memo)
+
+
+@pytest.mark.long
+def test_any_number_of_processes_gives_the_same_and_reports_the_broken_recording(tmp_path):
+    rng, paths = np.random.default_rng(1), [tmp_path / f"{i}.wav" for i in range(6)]
+    for path in paths:
+        soundfile.write(path, rng.uniform(-0.5, 0.5, (16_000, 16)), 8000, "PCM_24")
+    paths[2].write_bytes(b"no sound")
+    paths[4].unlink()
+    found = []
+    for jobs in (1, 2):
+        # A separate cache, so that no result of the previous run is reused.
+        work = Levels(tmp_path / f"cache {jobs}")
+        work.folder.mkdir()
+        done = attempted(work, paths, jobs, name=lambda path: path.stem)
+        first = next(done)
+        assert jobs > 1 or (work.folder / "log").read_text() == "0.wav\n"  # Each when it is asked for
+        every = [first, *done]
+        failed = [one for one in every if isinstance(one, Failed)]
+        heard = [one for one in every if not isinstance(one, Failed)]
+        found.append(([(one.name, one.gram.tobytes(), one.level.tobytes()) for one in heard], failed))
+        assert sorted((work.folder / "log").read_text().split()) == [f"{i}.wav" for i in (0, 1, 2, 3, 5)]
+    assert found[0] == found[1]
+    assert [one.name for one in failed] == ["2", "4"]
+    assert f"{paths[2]}: expected a sound file" in failed[0].problem
+    assert str(paths[4]) in failed[1].problem
+
+
+def test_a_programming_error_is_not_a_broken_recording():
+    with pytest.raises(TypeError, match="has no len"):
+        list(attempted(len, [[0], 1, [2]], jobs=1))
