@@ -199,12 +199,6 @@ def test_counts_are_preserved_in_the_table(misses):
     assert counts_of(counts_table(counts(misses))) == counts(misses)
 
 
-def test_counts_of_two_recordings_add_up():
-    both = counts(RISING)["blur"] + counts(RISING)["blur"]
-    assert np.array(both.misses) == pytest.approx(2.0 * np.array(RISING))
-    assert both.sectors == (20,) * 5
-
-
 def recording(root, site, label, number, filmed=True):
     folder = Path(root) / site / label / f"{label}{site}{number}"
     folder.mkdir(parents=True)

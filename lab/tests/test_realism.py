@@ -22,14 +22,12 @@ from worldstate_lab.streets.simulated_windows import (
     DECIMATION,
     MEASURES,
     RATE_HZ,
-    WindowPlan,
     describe_windows,
     permuted_array,
     set_figures,
     simulated_window_pair,
     spread_values,
     window_features,
-    windows_of_recording,
 )
 
 from worldstate.abduction.signature.ensemble import mirror_features
@@ -37,7 +35,6 @@ from worldstate.adapters.datasets.feature_table import FeatureTable, read_featur
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.direction.feature import feature_nfft, published_feature
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.simulation.scene.presets import preset
 
 LABELS = ("left", "right", "none", "front")
 PLACES = ("SA1", "SA2", "SB1", "SB2")
@@ -203,17 +200,6 @@ def test_the_feature_at_a_quarter_of_the_rate_is_the_published_one():
     # With permuted positions no beam is coherent at high frequencies; at low ones the spacing does not
     # matter.
     assert np.ptp(permuted) < 0.7 * np.ptp(quarter)
-
-
-def test_windows_of_a_simulated_approach_have_features_with_correct_and_permuted_positions():
-    plan = WindowPlan(0, "SB1", "left", np.random.SeedSequence(3))
-    rows = windows_of_recording(preset(), plan)
-    assert [row[1:] for row in rows] == [("left", "SB1", "0"), ("front", "SB1", "0")]
-    right, permuted = np.array([row[0] for row in rows]).transpose(1, 0, 2)
-    assert right.shape == (2, 60)
-    assert (right > 0.0).all()
-    assert (permuted > 0.0).all()
-    assert not np.allclose(permuted, right, rtol=0.01)
 
 
 def test_windows_have_the_times_of_the_released_program(monkeypatch):

@@ -17,7 +17,7 @@ from worldstate_lab.methods.line_of_sight import OcSortRecovery
 from worldstate_lab.sequences.path_figures import exam_figures
 from worldstate_lab.sequences.path_tables import alarm_table
 from worldstate_lab.sequences.recordings import NANODET_BOXES
-from worldstate_lab.sequences.scores import alarm_row, calibration, curve, hop_before, leads, sweep
+from worldstate_lab.sequences.scores import alarm_row, calibration, curve, leads, sweep
 
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S
 from worldstate.adapters.files.array_file import read_array
@@ -161,12 +161,6 @@ def test_chances_are_compared_with_the_side_of_the_vehicle() -> None:
     assert half["ece"] == pytest.approx(0.5 * true["base_rate"])
     unknown = [replace(one, hops=one.hops.replace(within=np.full((81, 2, 4), np.nan))) for one in trials]
     assert calibration(unknown, draw())["ece"] is None
-
-
-def test_a_time_between_two_hops_matches_none() -> None:
-    trial = corner(1, 0)[0]
-    assert trial.hops.time_s[hop_before(trial, 1.5)].tolist() == [3.5]
-    assert hop_before(trial, 4.2).size == 0
 
 
 def test_the_tracker_accepts_boxes_by_its_filter() -> None:

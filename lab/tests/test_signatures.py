@@ -139,11 +139,13 @@ def test_rows_of_a_missing_corpus_contain_the_command_that_computes_them(folders
     assert all(row.value is not None for row in rows if row.name == "tram by level, phone microphones")
 
 
-def test_a_wrong_folder_is_one_line_and_exit_code_two(tmp_path, capsys):
-    assert main(["corpora", "--idmt", str(tmp_path)]) == 2
-    assert "missing: annotation/idmt_traffic_all.txt" in capsys.readouterr().err
-
-
-def test_without_a_corpus_the_command_lists_its_options(capsys):
-    assert main(["corpora"]) == 2
-    assert "expected --idmt, --melaudis or both" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--idmt", "."], "missing: annotation/idmt_traffic_all.txt"),
+        ([], "expected --idmt, --melaudis or both"),
+    ],
+)
+def test_without_a_corpus_the_command_is_rejected(words, problem, capsys):
+    assert main(["corpora", *words]) == 2
+    assert problem in capsys.readouterr().err

@@ -82,17 +82,19 @@ def test_every_name_of_the_documented_form_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("lost", "named"),
+    ("write", "read", "lost"),
     [
-        ("annotation/eusipco_2021_test.txt", "annotation/eusipco_2021_test.txt"),
-        ("annotation/idmt_traffic_all.txt", "annotation/idmt_traffic_all.txt"),
-        (f"audio/{IDMT_NAMES[1]}.wav", IDMT_NAMES[1]),
+        (write_idmt, idmt_traffic, "annotation/eusipco_2021_test.txt"),
+        (write_idmt, idmt_traffic, "annotation/idmt_traffic_all.txt"),
+        (write_idmt, idmt_traffic, f"audio/{IDMT_NAMES[1]}.wav"),
+        (write_melaudis, melaudis, "MELAUDIS_Vehicles"),
+        (write_melaudis, melaudis, "MELAUDIS_BG"),
     ],
 )
-def test_a_partial_idmt_folder_is_rejected_with_the_missing_files(tmp_path, lost, named):
-    (write_idmt(tmp_path) / lost).unlink()
-    with pytest.raises(InputFileError, match=re.escape(named)):
-        idmt_traffic(tmp_path)
+def test_a_partial_folder_is_rejected_with_the_missing_files(tmp_path, write, read, lost):
+    (write(tmp_path / "corpus") / lost).rename(tmp_path / "elsewhere")
+    with pytest.raises(InputFileError, match=f"missing: {re.escape(lost)}"):
+        read(tmp_path / "corpus")
 
 
 @pytest.mark.parametrize("name", ["car_01", f"{CAR}_SE_CH34-BG", EMPTY + "_SE_CH34", "../../etc/passwd"])
@@ -126,14 +128,6 @@ def test_melaudis_background_is_cut_into_clips_within_the_file(tmp_path):
     passage = next(clip for clip in melaudis(tmp_path) if clip.labels.kind == "car")
     assert short.labels.recording == passage.labels.recording, "the same day at the same spot"
     assert len({clip.labels.recording for clip in night}) == 1
-
-
-@pytest.mark.parametrize("lost", ["MELAUDIS_Vehicles", "MELAUDIS_BG"])
-def test_a_partial_melaudis_folder_is_rejected_with_the_missing_files(tmp_path, lost):
-    write_melaudis(tmp_path)
-    (tmp_path / lost).rename(tmp_path / "elsewhere")
-    with pytest.raises(InputFileError, match=rf"missing: {lost}"):
-        melaudis(tmp_path)
 
 
 def test_names_of_another_release_are_rejected_and_not_partly_used(tmp_path):
