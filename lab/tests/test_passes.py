@@ -314,19 +314,6 @@ def test_the_guard_acts_in_the_exam_as_in_a_run(tmp_path: Path) -> None:
         assert other.heard == beside_foreign(other.domain, one.heard)
 
 
-@given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.2))
-@settings(max_examples=10)
-def test_a_hidden_bearing_is_behind_the_edge_and_is_mirrored(seed: int, edge_rad: float) -> None:
-    coming = np.random.default_rng(seed).dirichlet(np.ones(len(COMING_S)))
-    sides = [SideGeometry("left", s * edge_rad, s * 1.2, 0.35) for s in (1.0, -1.0)]
-    (left, std), (right, same) = (hidden_bearing(coming, side) for side in sides)
-    assert (left, std) == pytest.approx((-right, same))
-    assert edge_rad - 1e-9 <= left <= math.radians(80.0) and 0.0 < std < 0.6
-    nearer = coming.copy()
-    nearer[0], nearer[1:] = 0.9, 0.1 * coming[1:] / coming[1:].sum()
-    assert coming[0] > 0.9 or hidden_bearing(nearer, sides[0])[0] <= left + 1e-9
-
-
 @given(st.floats(0.0, 8.0))
 @settings(max_examples=20)
 def test_a_known_edge_narrows_the_bearing_and_keeps_the_errors_of_the_time(edge_deg: float) -> None:

@@ -173,22 +173,13 @@ def test_the_tracker_accepts_boxes_by_its_filter() -> None:
     assert wide.fit([], draw())(trial).alarm.any()
 
 
-KEYS = {
-    *("recordings", "rows", "leads", "at_onsets", "at_false_recordings", "horizons", "risk", "calibration"),
-    *("front_end", "identity_kept", "hand_over_delay_s", "bearing_error_deg"),
-}
-
-
 def test_the_command_scores_a_made_up_corner(tmp_path, capsys) -> None:
     folder = write_corner(tmp_path / "corner", draw())
     assert main(["sequences", str(folder), "--results", str(tmp_path / "results.json"), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     found = report["seven"]
-    assert set(found) >= KEYS
     assert found["recordings"] == 4
     assert found["failed"] == {}
-    row = {"warned", "lead_s", "alarms_per_hour", "false_recordings", "advisory_share", "interval"}
-    assert all(set(one) >= row for one in found["rows"].values())
     assert {"world-state advisory", "Vision-only", "OC-SORT recovery (coasting)"} <= set(found["rows"])
     assert found["rows"]["Vision-only"]["warned"] == 0.0
     assert list(found["leads"]) == ["0.5", "1", "1.5", "2", "3", "5", "6"]
@@ -212,25 +203,20 @@ def test_the_command_prints_tables_without_a_camera_and_start(tmp_path, capsys) 
 
 
 @pytest.mark.parametrize(
-    ("words", "problem"),
+    ("words", "hazard_free", "problem"),
     [
-        (["--features", "a.csv"], "--lists"),
-        (["--model", "a.json"], "--path"),
-        (["--path", "seven", "--streams", "a.npz"], "expected no --path"),
-        (["--start", "9"], "--start"),
+        (["--features", "a.csv"], 2, "--lists"),
+        (["--model", "a.json"], 2, "--path"),
+        (["--path", "seven", "--streams", "a.npz"], 2, "expected no --path"),
+        (["--start", "9"], 2, "--start"),
+        ([], 0, "found one kind"),
+        ([], 2, "srp.npz"),
     ],
 )
-def test_unsuitable_options_are_rejected(tmp_path, capsys, words, problem) -> None:
-    folder = write_corner(tmp_path / "corner", draw())
-    assert main(["sequences", str(folder), *words]) == 2
-    assert problem in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("hazard_free", "problem"), [(0, "found one kind"), (2, "srp.npz")])
-def test_unsuitable_recordings_are_rejected(tmp_path, capsys, hazard_free, problem) -> None:
+def test_unsuitable_options_and_recordings_are_rejected(tmp_path, capsys, words, hazard_free, problem):
     folder = write_corner(tmp_path / "corner", draw(), hazard_free=hazard_free)
     (folder / "srp.npz").unlink()
-    assert main(["sequences", str(folder)]) == 2
+    assert main(["sequences", str(folder), *words]) == 2
     assert problem in capsys.readouterr().err
 
 
