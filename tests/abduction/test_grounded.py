@@ -176,18 +176,9 @@ def frame(approach):
     return replace(frame, bearing_rad=0.2, bearing_std_rad=0.05, prominence=2.0, looming=looming, tone=tone)
 
 
-def interpreted(frame, grounding=None):
-    return AcousticAdapter(roof_array_56(), 48_000.0, Flat(), grounding=grounding).interpret(frame)
-
-
-@pytest.mark.long
-def test_off_by_default(frame, approach):
-    assert interpreted(frame).signature is SCORES
-    assert open_source(approach.folder).settings.grounding is None
-
-
 def test_each_measurement_carries_its_own_spread(frame):
-    measurement = interpreted(frame)
+    measurement = AcousticAdapter(roof_array_56(), 48_000.0, Flat()).interpret(frame)
+    assert measurement.signature is SCORES  # grounding is off by default
     seen = observe(frame, measurement.bearing, measurement.approach)
     assert (seen.bearing_rad.value, seen.bearing_rad.std) == pytest.approx((0.2, 0.05))
     assert (seen.inverse_tta_hz.value, seen.inverse_tta_hz.std) == (0.4, 0.05)

@@ -22,7 +22,6 @@ from worldstate.abduction.road_users import (
 )
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.serialisation import decode, encode
 
 CLASSES = ("van", "car", "unknown")
 
@@ -108,11 +107,6 @@ def test_a_signal_must_exceed_foreign_sounds_by_its_margin(x: np.ndarray) -> Non
     share = softmax(GUARD.weights @ x + GUARD.biases)
     verdict, nats = GUARD.judge(x), np.log(share[3]) - np.log(share[1] + share[2])
     assert isinstance(verdict, WarningSignal) == (verdict.log_odds > 0.0 and nats > 1.0)
-
-
-@given(measures)
-def test_a_file_gives_the_same_verdict(x: np.ndarray) -> None:
-    assert decode(DomainGuard, encode(GUARD), "guard").judge(x) == GUARD.judge(x)
 
 
 levels = st.floats(-20.0, 20.0)

@@ -83,22 +83,6 @@ def test_wandering_engine_in_acoulars_pass_by_is_not_usable(period_s):
     assert isinstance(radial_speed(track_fundamental(x, rate)), NotUsable)
 
 
-def smooth_noise(rng):
-    """Random wander of about 1 Hz bandwidth, at most 5 per cent."""
-    grid = np.linspace(-2.0, 7.0, 40)
-    values = np.convolve(rng.normal(size=40), np.hanning(7), mode="same")
-    return lambda t: 0.05 * np.interp(t, grid, values / np.abs(values).max())
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("speed", [0.0, 12.0])
-def test_random_wander_is_never_usable(speed):
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        x, _, _ = pass_by(rng, rng.uniform(30, 90), speed, 2.5, 6.0, smooth_noise(rng))
-        assert isinstance(radial_speed(track_fundamental(x, RATE)), NotUsable)
-
-
 def test_an_engine_that_runs_down_at_the_kerb_is_not_a_pass_by():
     for seed, width in enumerate((0.4, 0.8, 1.2, 2.0)):
         rng = np.random.default_rng(seed)

@@ -53,12 +53,6 @@ def test_an_array_has_the_ambiguity_of_its_geometry(positions: list[list[float]]
     assert MicrophoneArray(positions).ambiguity == expected
 
 
-def test_a_planar_array_has_equal_steering_front_and_back() -> None:
-    array = roof_array_56()
-    front, back = array.steering(1000.0, [0.4, np.pi - 0.4])[0].T
-    np.testing.assert_allclose(front, back, atol=1e-12)
-
-
 @given(st.integers(2, 9), st.integers(0, 2**32 - 1), st.floats(0.0, 3.0), st.data())
 def test_microphones_at_one_place_raise_an_error_with_their_numbers(n, seed, in_least, data) -> None:
     """All other microphones are 1 m apart."""
@@ -90,12 +84,6 @@ def test_acoular_reads_the_same_places(tmp_path: Path) -> None:
     write_array_xml(tmp_path / "roof.xml", array)
     x, y, z = acoular.MicGeom(file=tmp_path / "roof.xml").pos_total
     np.testing.assert_array_equal(np.column_stack([z, -x, y]) + 0.0, array.positions_m)
-
-
-def test_right_in_the_file_is_right_of_the_vehicle(tmp_path: Path) -> None:
-    name = tmp_path / "mics.xml"
-    name.write_text('<MicArray><pos x="0.4" y="0" z="0"/><pos x="0" y="0.3" z="0.1"/></MicArray>')
-    np.testing.assert_array_equal(read_array(name).positions_m, [[0, -0.4, 0], [0.1, 0, 0.3]])
 
 
 def test_the_released_array_has_the_papers_moment() -> None:

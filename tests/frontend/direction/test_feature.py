@@ -12,7 +12,7 @@ import pyroomacoustics
 import pytest
 import scipy.signal
 import soundfile
-from acoular_scene import RATE, pass_by, render
+from acoular_scene import RATE
 from plane_waves import noise_from
 
 from worldstate.adapters.files.model_file import read_model
@@ -21,7 +21,6 @@ from worldstate.frontend.array.steering import cross_spectra
 from worldstate.frontend.direction.feature import feature_steering, pair_sum, published_feature
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.frontend.stream import FrontEnd
-from worldstate.simulation import SITES, draw_settings, simulate_recording
 
 ROOF = roof_array_56()
 SMALL = MicrophoneArray(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 3)))
@@ -131,34 +130,3 @@ def test_same_class_on_a_simulated_recording_and_in_noise(approach) -> None:
     found = compare(seconds_of(sound, 1.0))
     more = compare(plane_waves(6, np.random.default_rng(2)))
     assert len(set(found) | set(more)) >= 3
-
-
-@pytest.mark.slow
-def test_same_class_over_sites_pass_bys_and_noise() -> None:
-    rng, classes = np.random.default_rng(3), []
-    for name in SITES:
-        for side in ("left", "right", "none"):
-            settings = draw_settings(name, side, rng, 6.0)
-            classes += compare(seconds_of(simulate_recording(settings, rng, ROOF).audio, 0.5)).tolist()
-    sound = render(ROOF, pass_by, 2.0, seed=1)
-    sound += 0.02 * rng.standard_normal(sound.shape)
-    classes += compare(seconds_of(sound, 0.2)).tolist()
-    classes += compare(plane_waves(40, rng)).tolist()
-    print({name: classes.count(name) for name in set(classes)})
-    assert len(classes) > 200
-    assert set(classes) == {"front", "left", "none", "right"}
-
-
-@pytest.mark.slow
-def test_the_stream_gives_nearly_always_the_class_of_the_whole_window() -> None:
-    """Edge frames differ because a stream has no zero padding."""
-    rng, same = np.random.default_rng(4), []
-    for name in SITES:
-        for side in ("left", "right", "none"):
-            sound = simulate_recording(draw_settings(name, side, rng, 6.0), rng, ROOF).audio
-            frames = FrontEnd(ROOF, RATE).process(sound)[::3]
-            windows = [sound[frame.sample_index - RATE : frame.sample_index] for frame in frames]
-            whole = [published_feature(window, ROOF, RATE) for window in windows]
-            same += (classes_of([frame.feature for frame in frames]) == classes_of(whole)).tolist()
-    print(f"same class in {100 * np.mean(same):.1f} % of {len(same)} windows")
-    assert np.mean(same) > 0.9

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plane_waves import noise_from
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
 from worldstate.frontend.health.channel_health import ArrayHealth, DropoutFinder
 from worldstate.frontend.health.channel_monitor import ClippingCounter
-from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.values import NotUsable
 from worldstate.simulation import draw_settings, simulate_recording
@@ -108,18 +106,6 @@ def test_exactly_the_faults_present_are_found(kind: str, seed: int) -> None:
     assert last.n_dropouts == 0
 
 
-def test_several_faults_at_once_are_found() -> None:
-    sound = street(ROOF, 4)
-    rng = np.random.default_rng(44)
-    sound[:, [7, 40]] = sound[:, [40, 7]]
-    sound[:, 12] *= -1
-    sound[:, 33] = rng.standard_normal(len(sound))
-    sound[:, [0, 50]] = 0.0
-    last = healths(ROOF, sound)[-1]
-    assert named(last) == {"dead": [0, 50], "swapped": [7, 40], "inverted": [12], "noisy": [33]}
-    assert {(one.channel, one.looks_like) for one in last.faults if one.looks_like} == {(7, 40), (40, 7)}
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "levels"), [*((seed, None) for seed in range(100, 104)), *((8, levels) for levels in (2, 5, 30))]
@@ -172,18 +158,6 @@ def test_a_dead_channel_is_masked_at_once_and_returns() -> None:
     assert found[-1].mask.is_whole
 
 
-def test_leaving_out_noise_keeps_the_bearing() -> None:
-    sound, rng = noise_from(ROOF, 0.5, RATE, 3.0, seed=2), np.random.default_rng(2)
-    noisy = rng.choice(56, 20, replace=False)
-    sound[:, noisy] = 2 * sound.std() * rng.standard_normal((len(sound), 20))
-    watched, unwatched = (
-        FrontEnd(ROOF, RATE, FrontEndSettings(watch_channels=on)).process(sound)[11:] for on in (True, False)
-    )
-    assert all(set(named(frame.health)["noisy"]) == set(noisy) for frame in watched)
-    assert max(abs(frame.bearing_rad - 0.5) for frame in watched) < np.radians(0.5)
-    assert np.mean([f.prominence for f in watched]) > np.mean([f.prominence for f in unwatched])
-
-
 @pytest.mark.long
 @settings(deadline=None, max_examples=5)
 @given(dead=st.sets(st.integers(0, 27), max_size=20), seed=st.integers(0, 99))
@@ -196,17 +170,6 @@ def test_a_mask_equals_the_array_without_those_channels(dead: set[int], seed: in
     np.testing.assert_allclose(ours.srp, theirs.srp, rtol=1e-4)
     np.testing.assert_allclose(ours.feature, theirs.feature, rtol=1e-3)
     assert ours.bearing_rad == pytest.approx(theirs.bearing_rad, abs=1e-4)
-
-
-def test_clipped_microphones_stay_in_use() -> None:
-    clean = noise_from(ROOF, 0.5, RATE, 1.6, seed=3)
-    clipped, sound = np.random.default_rng(3).choice(56, 20, replace=False), clean.copy()
-    sound[:, clipped] = sound[:, clipped].clip(-0.5 * sound.std(), 0.5 * sound.std())
-    ours, theirs = (FrontEnd(ROOF, RATE).process(one) for one in (sound, clean))
-    assert set(named(ours[-1].health)["clipped"]) == set(clipped)
-    assert ours[-1].health.mask.is_whole
-    for one, other in zip(ours, theirs, strict=True):
-        assert one.bearing_rad == pytest.approx(other.bearing_rad, abs=np.radians(0.1))
 
 
 def test_a_dying_channel_causes_no_step_in_looming_and_levels() -> None:

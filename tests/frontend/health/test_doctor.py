@@ -16,7 +16,6 @@ from worldstate.frontend.health.channel_health import Fault
 from worldstate.operations.recordings.channel_report import (
     ChannelVerdict,
     RecordingHealth,
-    rate_from_duration,
     write_array_figure,
 )
 from worldstate.simulation import draw_settings, simulate_recording
@@ -118,8 +117,3 @@ def test_open_audio_lists_silent_channels(tmp_path: Path) -> None:
     with open_audio(tmp_path / "a.wav", strict=False) as source:
         assert source.silent_channels == (1, 3)
         assert len(np.concatenate(list(source.blocks(1000)))) == 9000
-
-
-def test_a_known_duration_checks_the_sample_rate() -> None:
-    assert rate_from_duration(28_798_800, 600.0, 0.001, 48_000.0).is_wrong
-    assert not rate_from_duration(28_798_800, 600.0, 0.02, 48_000.0).is_wrong
