@@ -1,5 +1,7 @@
 """The renderers of rays and of mirrors against image sources, a wedge and laws of reflection."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +28,16 @@ YARD = np.array([(-6, -4), (14, -4), (14, 7), (-6, 7)], float)
 
 plans = st.builds("{}{}".format, st.sampled_from(["MA", "MB"]), st.integers(1, 999)).map(drawn_site)
 shares = st.floats(0.05, 0.95)
+
+
+@contextmanager
+def built(fronts: Fronts) -> Iterator[None]:
+    """Build every street of these fronts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mirrors, "drawn_fronts", lambda _: fronts)
+        mirrors.images_at.cache_clear()
+        yield
+    mirrors.images_at.cache_clear()
 
 
 def closed(corners: np.ndarray, kept: np.ndarray) -> Fronts:
@@ -117,13 +129,10 @@ def test_a_mirrored_plan_sounds_mirrored(plan, y) -> None:
         plan, corner_left_m=right, corner_right_m=left, side_wall_left_m=right, side_wall_right_m=left
     )
     lane, sounds, opened = plan.lanes_m[0], [], []
-    with pytest.MonkeyPatch.context() as patch:
-        for street, ends, sign in ((plan, fronts.ends_m, 1.0), (other, fronts.ends_m * turned, -1.0)):
-            patch.setattr(mirrors, "drawn_fronts", lambda _, ends=ends: Fronts(ends, fronts.kept))
-            mirrors.images_at.cache_clear()
+    for street, ends, sign in ((plan, fronts.ends_m, 1.0), (other, fronts.ends_m * turned, -1.0)):
+        with built(Fronts(ends, fronts.kept)):
             sounds.append(impulses(street, (lane, sign * y), RING * np.array([1.0, sign, 1.0])))
             opened.append(mirrors.images_at(street, 0.0, 0.0).opened(mirrors.DIRECTIONS))
-    mirrors.images_at.cache_clear()
     np.testing.assert_allclose(sounds[0], sounds[1], atol=1e-4 * np.abs(sounds[0]).max())
     np.testing.assert_allclose(opened[0], opened[1][::-1], rtol=1e-6)
 
@@ -136,12 +145,8 @@ def test_the_opposite_wall_reflects_a_hidden_vehicle() -> None:
         place = np.array([plan.lanes_m[0], plan.sight_m(plan.lanes_m[0])[1] + 6.0])
         fronts, heard = drawn_fronts(plan), impulses(plan, (place[0], place[1]), RING)
         opposite = np.isclose(fronts.ends_m[:, :, 0], plan.opposite_wall_m).all(axis=1)
-        alone = Fronts(fronts.ends_m[~opposite], fronts.kept[~opposite])
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(mirrors, "drawn_fronts", lambda _, alone=alone: alone)
-            mirrors.images_at.cache_clear()
+        with built(Fronts(fronts.ends_m[~opposite], fronts.kept[~opposite])):
             without = impulses(plan, (place[0], place[1]), RING)
-        mirrors.images_at.cache_clear()
         louder.append(10.0 * np.log10(np.square(heard).sum() / np.square(without).sum()))
     assert min(louder) > 0.0 and np.median(louder) > 3.0, np.round(louder, 1)
 
@@ -180,14 +185,12 @@ def test_the_level_is_continuous_at_the_edge_of_the_shadow(plan, side) -> None:
     assert level_db[0] < -9.0 and abs(level_db[-1]) < 1.0
 
 
-def test_absorbing_walls_leave_direct_and_diffracted_sound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_absorbing_walls_leave_direct_and_diffracted_sound() -> None:
     plan = drawn_site("MA7")
     fronts = drawn_fronts(plan)
-    monkeypatch.setattr(mirrors, "drawn_fronts", lambda _: Fronts(fronts.ends_m, 0.0 * fronts.kept))
-    mirrors.images_at.cache_clear()
     y = np.linspace(-25.0, 25.0, 201)
-    ways = mirrors.ways_of(plan, silent_at(plan.lanes_m[0], y), np.array([0.0, 0.0, 1.7]))
-    mirrors.images_at.cache_clear()
+    with built(Fronts(fronts.ends_m, 0.0 * fronts.kept)):
+        ways = mirrors.ways_of(plan, silent_at(plan.lanes_m[0], y), np.array([0.0, 0.0, 1.7]))
     audible = [way for way in ways if way.gain.any()]
     assert len(ways) > 6 and len(audible) == 3  # straight, round the left corner, round the right one
 

@@ -12,7 +12,7 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import resample_poly
-from simulated_sound import PAIR, made, refusal
+from simulated_sound import PAIR, made, refusal, rendered, source_in, street_of
 
 from worldstate.adapters.camera.detections import read_detections
 from worldstate.adapters.camera.pinhole import PinholeCamera
@@ -48,7 +48,7 @@ from worldstate.simulation.sound.propagation import add_sources
 from worldstate.simulation.sound.receiver import Receiver, standing_m
 from worldstate.simulation.sound.renderers import add_ambience
 from worldstate.simulation.sound.scatter import add_scattered
-from worldstate.simulation.sound.static_field import StaticSources, StreetSound
+from worldstate.simulation.sound.static_field import PlacedSource
 
 
 @pytest.mark.long
@@ -231,21 +231,19 @@ def vehicle_sound(
     rate: float,
 ) -> np.ndarray:
     """Return the sound of one vehicle with these signals at an array by every path, (M, n)."""
-    knots = np.arange(-(-samples // KNOT_SAMPLES) + 1) * KNOT_SAMPLES / rate
-    receiver = Receiver(standing_m(array), np.zeros(array.n_microphones), knots, settings.ego)
-    out = np.zeros((array.n_microphones, receiver.samples), np.float32)
-    street = StreetSound(StaticSources(out, rate), settings.site, settings.preset, receiver)
-    emitted = -BEFORE * KNOT_SAMPLES / LOW_HZ
-    emitted += np.arange(len(sources[0].signal) // KNOT_SAMPLES + 1) * KNOT_SAMPLES / rate
-    (path,) = trajectories(settings, emitted)
-    *moving, middle = (
-        street.source(one.signal, emitted, path.behind(one.behind_m), one.height_m)
-        for one in [*sources, SourceSignal(sum(s.signal for s in sources), 1.0, SOURCE_HEIGHT_M)]
-    )
-    add_sources(street, moving)
-    add_scattered(street, middle)
-    street.static.render()
-    return out[:, :samples]
+    seconds = -(-samples // KNOT_SAMPLES) * KNOT_SAMPLES / rate
+    street = street_of(settings.site, standing_m(array), seconds + 1e-6, rate, settings.ego, settings.preset)
+
+    def placed(one: SourceSignal) -> PlacedSource:
+        def way(time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return trajectories(settings, time_s)[0].behind(one.behind_m)
+
+        head_s = BEFORE * KNOT_SAMPLES / LOW_HZ
+        return source_in(street, lambda time_s: one.signal[: len(time_s)], way, head_s, one.height_m)
+
+    add_sources(street, [placed(one) for one in sources])
+    add_scattered(street, placed(SourceSignal(sum(one.signal for one in sources), 1.0, SOURCE_HEIGHT_M)))
+    return rendered(street)[:, :samples]
 
 
 def decimated(sound: np.ndarray) -> np.ndarray:

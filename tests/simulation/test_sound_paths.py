@@ -233,20 +233,6 @@ def test_images_of_a_hidden_vehicle_follow_one_another(aside, ahead, lane, y):
             assert path.lit[0] == float(inside > 0.0), order
 
 
-@pytest.mark.parametrize("name", SITES)
-def test_side_walls_do_not_hide_their_corner(name):
-    """A wall in the line of sight to its corner would hide the street."""
-    plan = site(name)
-    for wall, corner, openings in (
-        (plan.side_wall_left_m, plan.corner_left_m, plan.left_openings_m),
-        (plan.side_wall_right_m, plan.corner_right_m, plan.right_openings_m),
-    ):
-        x = np.linspace(0.0, plan.corner_ahead_m, 1001)
-        stands = np.all([(x < begin) | (x > end) for begin, end in openings], axis=0)
-        assert stands.any()
-        assert np.all(corner / plan.corner_ahead_m * x[stands] <= wall + 0.01)
-
-
 COARSE_FS, HEIGHT_M = 12_000.0, 1.7
 MERGE = replace(OPEN, occluders=(OccludingBody(((-60.0, 2.6), (7.0, 2.6))),))
 # Corners before set-back walls; nothing opposite.
