@@ -169,18 +169,6 @@ def test_memory_does_not_grow_in_an_hour_of_56_channels() -> None:
     assert resident_bytes() - resident < 4_000_000
 
 
-def test_the_check_for_lost_samples_does_not_change_clean_sound() -> None:
-    sound, chosen = noise_from(SQUARE, 0.5, RATE, 2.0), FrontEndSettings(character=True)
-    watched, plain = (
-        FrontEnd(SQUARE, RATE, replace(chosen, watch_channels=on)).process(sound) for on in (True, False)
-    )
-    for one, other in zip(watched, plain, strict=True):
-        for name in ("feature", "srp", "band_log_energy", "bearing_rad", "prominence", "bearing_age_s"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-        assert one.looming == other.looming
-        assert (one.lost, one.heard, one.unheard) == (0.0, 1.0, None)
-
-
 def lose(sound: np.ndarray, first: int, length: int, value: float = 0.0) -> np.ndarray:
     hurt = sound.copy()
     hurt[first : first + length] = value

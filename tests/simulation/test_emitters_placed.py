@@ -211,17 +211,6 @@ def test_an_added_sound_leaves_the_rest_unchanged():
     assert told["azimuth_rad"][0] == 0.0 and told["range_m"][0] == 4.0
 
 
-def test_rain_removes_detections_while_it_falls():
-    scene = SimulationSettings(
-        site("SB1"), "none", duration_s=6.0, parked_car=True, sample_rate_hz=8000.0, preset=QUIET
-    )
-    wet = replace(scene, sounds=(SoundSettings("rain", 2.0, 4.0, lens_missed=0.7),))
-    dry, seen = (simulate_recording(each, np.random.default_rng(1), PAIR).detections for each in (scene, wet))
-    assert seen[:20] == dry[:20]
-    before, after = (sum(len(frame) for frame in each[20:]) for each in (dry, seen))
-    assert after / before == pytest.approx(0.3, abs=0.2)
-
-
 @settings(max_examples=15, deadline=None)
 @given(
     st.sampled_from((*SITES, "SM1")),

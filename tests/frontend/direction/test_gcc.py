@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize_scalar
 from scipy.signal import ShortTimeFFT
 
 from worldstate.frontend.bounds.cramer_rao import delay_crb_s2
@@ -32,23 +31,6 @@ def test_noiseless_delays_are_exact_between_samples(arrivals):
     i, j = all_pairs(len(arrivals)).T
     np.testing.assert_allclose(got.delay_s, np.subtract(arrivals, 0)[i] - np.array(arrivals)[j], atol=1e-12)
     np.testing.assert_allclose(got.peak, 1.0, atol=1e-9)
-
-
-def test_peak_is_the_maximum_of_the_dirichlet_kernel_sum():
-    """Two unequal paths have no closed-form peak: compare with a bounded search of the same function."""
-    rng = np.random.default_rng(3)
-    X = delayed([2.0e-4, 0.0], rng) + 0.6 * delayed([-3.0e-4, 0.0], rng)
-    got = gcc_delays(X, FREQUENCIES, 1e-3)
-    G = (X[..., 0] * X[..., 1].conj()).mean(axis=0)
-    G /= np.abs(G)
-
-    def minus_correlation(tau):
-        return -np.real(np.sum(G * np.exp(2j * np.pi * FREQUENCIES * tau)))
-
-    grid = np.linspace(-1e-3, 1e-3, 20001)
-    start = grid[np.argmin([minus_correlation(t) for t in grid])]
-    best = minimize_scalar(minus_correlation, bounds=(start - 2e-7, start + 2e-7), options={"xatol": 1e-13})
-    assert got.delay_s[0] == pytest.approx(best.x, abs=1e-10)
 
 
 @pytest.mark.long

@@ -1,13 +1,10 @@
-"""MUSIC against pyroomacoustics, the Gram trick and the number of sources."""
+"""MUSIC against pyroomacoustics, with fewer frames than microphones too, and the number of sources."""
 
 import numpy as np
 import pyroomacoustics as pra
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from worldstate.frontend.direction.music import (
-    Subspace,
     count_sources,
     covariance,
     music_spectrum,
@@ -24,9 +21,9 @@ def plate(microphones, rng):
     return np.column_stack([np.zeros(microphones), rng.uniform(-0.4, 0.4, (microphones, 2))])
 
 
-def steering(positions, azimuths, bins=BINS):
+def steering(positions, azimuths):
     directions = np.stack([np.cos(azimuths), np.sin(azimuths), np.zeros_like(azimuths)])
-    omega = 2 * np.pi * bins * SAMPLE_RATE_HZ / NFFT
+    omega = 2 * np.pi * BINS * SAMPLE_RATE_HZ / NFFT
     return np.exp(1j * omega[:, None, None] * (positions @ directions) / SOUND_M_S)
 
 
@@ -34,11 +31,10 @@ def circular(rng, *shape):
     return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
 
 
-def heard(positions, azimuths, rng, frames, snr=10.0, bins=BINS):
-    """Plane waves in white noise: spectra (frames, bins, M) complex64."""
-    waves = circular(rng, frames, len(bins), len(azimuths)) * np.sqrt(snr)
-    response = steering(positions, np.asarray(azimuths), bins)
-    signal = np.einsum("fbd,bmd->fbm", waves, response)
+def heard(positions, azimuths, rng, frames):
+    """Plane waves in white noise of twice their power: spectra (frames, bins, M) complex64."""
+    waves = circular(rng, frames, len(BINS), len(azimuths)) * np.sqrt(0.5)
+    signal = np.einsum("fbd,bmd->fbm", waves, steering(positions, np.asarray(azimuths)))
     return (signal + circular(rng, *signal.shape)).astype(np.complex64)
 
 
@@ -46,7 +42,7 @@ def heard(positions, azimuths, rng, frames, snr=10.0, bins=BINS):
 def test_spectrum_equals_pyroomacoustics(frames, sources):
     rng = np.random.default_rng(frames + sources)
     positions = plate(56, rng)
-    X = heard(positions, [0.4, -0.3][:sources], rng, frames, snr=0.5)
+    X = heard(positions, [0.4, -0.3][:sources], rng, frames)
     peer = pra.doa.MUSIC(positions.T, SAMPLE_RATE_HZ, NFFT, c=SOUND_M_S, num_src=sources, azimuth=AZIMUTHS)
     padded = np.zeros((56, NFFT // 2 + 1, frames), dtype=complex)
     padded[:, BINS] = X.transpose(2, 1, 0)
@@ -58,22 +54,6 @@ def test_spectrum_equals_pyroomacoustics(frames, sources):
     np.testing.assert_allclose(ours, theirs, rtol=2e-3)
 
 
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), frames=st.integers(3, 11), sources=st.integers(1, 3))
-def test_gram_trick_is_exact(seed, frames, sources):
-    rng = np.random.default_rng(seed)
-    X = circular(rng, frames, 4, 12)
-    short = signal_subspace(X, sources)
-    values, vectors = np.linalg.eigh(covariance(X))
-    full = Subspace(vectors[..., -sources:], values[..., -sources:])
-    np.testing.assert_allclose(short.eigenvalues, full.eigenvalues, rtol=1e-9)
-    np.testing.assert_allclose(_projector(short), _projector(full), atol=1e-7)
-
-
-def _projector(subspace: Subspace):
-    return subspace.vectors @ subspace.vectors.conj().transpose(0, 2, 1)
-
-
 @pytest.mark.parametrize(
     ("microphones", "frames", "truths", "azimuths_deg"),
     [*((12, 100, [truth] * 40, (-50, 10, 45)) for truth in range(4)), (56, 19, [0, 1, 2] * 10, (-40, 30))],
@@ -83,6 +63,6 @@ def test_number_of_sources(microphones, frames, truths, azimuths_deg):
     rng = np.random.default_rng(truths[-1])
     positions, hits = plate(microphones, rng), 0
     for truth in truths:
-        X = heard(positions, np.deg2rad(azimuths_deg[:truth]), rng, frames, snr=0.5)
+        X = heard(positions, np.deg2rad(azimuths_deg[:truth]), rng, frames)
         hits += count_sources(np.linalg.eigvalsh(covariance(X)), frames) == truth
     assert hits >= 0.9 * len(truths)

@@ -3,7 +3,6 @@
 import json
 import os
 from contextlib import closing
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -149,17 +148,6 @@ def test_common_sound_recovers_after_a_loss_of_any_length(lost: int, n: int) -> 
         share, reason = common.push(np.asarray(matrices, np.complex64), frames, keep)
         assert 0.0 <= share <= 1.0
     assert (share, reason) == (1.0, None)
-
-
-def test_the_mean_misfit_over_all_orders_is_one() -> None:
-    rng = np.random.default_rng(0)
-    positions = rng.uniform(-0.2, 0.2, (5, 3))
-    field = FarField(positions, BINS_HZ)
-    noise = rng.standard_normal((len(BINS_HZ), 5, 5)) + 1j * rng.standard_normal((len(BINS_HZ), 5, 5))
-    hermitian = np.asarray(noise + noise.conj().swapaxes(1, 2), np.complex64)
-    orders = [list(order) for order in permutations(range(5))]
-    misfits = [field.misfit(hermitian[:, one][:, :, one], 0.0) for one in orders]
-    assert np.mean(misfits) == pytest.approx(1.0, rel=1e-4) and np.std(misfits) > 0.01
 
 
 CROSSED = {

@@ -4,20 +4,16 @@ import re
 from collections import Counter
 from collections.abc import Callable
 from functools import cache
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from plane_waves import array_check, position_check
 from scipy.ndimage import map_coordinates
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.health.channel_health import ChannelFault
-from worldstate.frontend.health.geometry_check import best_card, runs, sharpness_gains, untilted
 from worldstate.frontend.stream import FrontEnd
 from worldstate.operations.recordings.channel_report import HealthLog
 from worldstate.simulation import site
@@ -145,40 +141,6 @@ def test_array_check_prints_the_delay_of_a_late_card(tmp_path, capsys):
     assert row.split()[:2] == ["5-8", "delayed"]
     assert re.search(r"0\.(2[5-9]|3[0-5]) \+- 0\.0\d ms later than the others", row)
     assert lines[-1] == "not healthy: delayed 5, 6, 7, 8; 4 left out by the front-end"
-
-
-@settings(deadline=None, max_examples=10)
-@given(seed=st.integers(0, 99))
-def test_the_gain_of_an_exchange_is_that_of_exchanged_channels(seed: int) -> None:
-    rng, (k, m, d) = np.random.default_rng(seed), (3, 5, 30)
-    sound = rng.standard_normal((k, m, 20)) + 1j * rng.standard_normal((k, m, 20))
-    coherence = (sound @ sound.conj().transpose(0, 2, 1)) * (1.0 - np.eye(m))
-    beams = np.exp(2j * np.pi * rng.random((k, m, d)))
-
-    def sharpness(matrix: np.ndarray) -> float:
-        power = np.einsum("kmd,kmj,kjd->d", beams.conj(), matrix, beams).real
-        return float(np.square(np.maximum(power, 0.0)).sum())
-
-    pairs = np.array(list(combinations(range(m), 2)))
-    for (a, b), gain in zip(pairs, sharpness_gains(coherence, beams, pairs), strict=True):
-        order = np.arange(m)
-        order[[a, b]] = b, a
-        expected = sharpness(coherence[:, order][:, :, order]) / sharpness(coherence)
-        assert np.exp(gain) == pytest.approx(expected, rel=1e-9)
-
-
-@settings(deadline=None, max_examples=20)
-@given(seed=st.integers(0, 999), amount=st.floats(-1.0, 1.0).filter(lambda a: abs(a) > 0.1))
-def test_a_card_is_found_under_any_tilt(seed: int, amount: float) -> None:
-    rng = np.random.default_rng(seed)
-    positions, candidates = rng.standard_normal((12, 3)), runs(12)
-    card = candidates[rng.integers(len(candidates))]
-    free = untilted(positions, np.ones(12, bool))
-    values = amount * card + 3.0 * positions @ rng.standard_normal(3) + 5.0
-    power = np.einsum("rm,mn,rn->r", candidates, free, candidates)
-    channels, found, _ = best_card(free @ values, power, candidates)
-    assert channels.tolist() == (card > 0.0).tolist()
-    assert found == pytest.approx(amount, rel=1e-6)
 
 
 @pytest.mark.slow
