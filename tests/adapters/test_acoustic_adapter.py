@@ -33,7 +33,7 @@ from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.errors import OutOfDomainError
-from worldstate.ground.values import NotUsable, nanoseconds
+from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Bearing, Heard, Measurement
 from worldstate.state.world_state import WorldState
 
@@ -56,13 +56,6 @@ def camera(azimuth_rad: float | None) -> VisionQuery:
         lefts = [column - 60.0 + 8.0 * (i % 3) for i in range(40)]
         frames = [boxed((left, 500.0, left + 120.0, 650.0)) for left in lefts]
     return VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate(frames, 10.0))
-
-
-@pytest.mark.parametrize("start_ns", [0, 1_700_000_000_000_000_000])
-def test_a_measurement_every_hop_after_the_first_second(start_ns: int) -> None:
-    found = measured(wave(0.3, 1.3), start_ns=start_ns)
-    assert [m.stamp_ns - start_ns for m in found] == [nanoseconds(t) for t in (1.0, 1.1, 1.2, 1.3)]
-    assert all(m.source == "acoustic" for m in found)
 
 
 @pytest.mark.parametrize("azimuth_rad", [-0.5, 0.0, 0.5])
@@ -341,10 +334,3 @@ def test_an_excluded_class_raises_the_miss_rate_or_is_unqueried() -> None:
     # A detector with one class is queried for any class.
     one = partial(query("car", "car").ask, 200_000_000, Bearing(0.0, 0.05))
     assert one({"truck"}) == one() != ask({"train"})
-
-
-def test_without_kinds_an_entity_is_unknown() -> None:
-    said, unknown = SURE.said, NotUsable("-")
-    told = [Measurement(hop * 10**8, said, Unqueried("-"), unknown, unknown) for hop in range(1, 6)]
-    (entity,) = followed(WorldFilter(), told).state.entities
-    assert [(one.label, one.probability) for one in entity.classification] == [("unknown", 1.0)]

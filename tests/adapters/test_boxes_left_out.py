@@ -99,13 +99,6 @@ def test_an_unknown_class_is_no_absence(name: str) -> None:
     assert isinstance(answers(moving(name), DetectionFilter({name.upper()}))[0], Present)
 
 
-@given(st.sampled_from([(a, b) for _, a, one in NAMED for _, b, other in NAMED if one and one == other]))
-@settings(deadline=None)
-def test_synonyms_change_nothing(names: tuple[str, str]) -> None:
-    one, other = (answers(moving(name), DetectionFilter({"car", "bus"})) for name in names)
-    assert one == other
-
-
 def scaled(log: DetectionLog, by: float) -> DetectionLog:
     return replace(log, frames=tuple(replace(one, boxes_px=one.boxes_px * by) for one in log.frames))
 

@@ -3,7 +3,6 @@
 import json
 import math
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +25,6 @@ from worldstate.adapters.vehicle.car_file import read_camera_setup
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
-from worldstate.ground.values import wrap_angle
 
 CAMERAS = st.builds(
     PinholeCamera.ovad,
@@ -37,11 +35,6 @@ CAMERAS = st.builds(
     roll_rad=st.floats(-0.3, 0.3),
     nominal_range_m=st.floats(5.0, 100.0),
 )
-
-
-def mirrored(camera: PinholeCamera) -> PinholeCamera:
-    x, y, z = camera.position_m
-    return replace(camera, position_m=(x, -y, z), yaw_rad=-camera.yaw_rad, roll_rad=-camera.roll_rad)
 
 
 @given(camera=CAMERAS, share=st.floats(0.0, 1.0))
@@ -56,12 +49,6 @@ def test_sees_between_its_edges(camera: PinholeCamera, inside: float, outside: f
     width = camera.width_px
     assert camera.sees(camera.azimuth(inside * width))
     assert not camera.sees(camera.azimuth([-outside * width, (1 + outside) * width])).any()
-
-
-@given(camera=CAMERAS, share=st.floats(0.0, 1.0))
-def test_the_mirrored_camera_sees_the_mirrored_world(camera: PinholeCamera, share: float) -> None:
-    there = float(mirrored(camera).azimuth((1.0 - share) * camera.width_px))
-    assert wrap_angle(there + float(camera.azimuth(share * camera.width_px))) == pytest.approx(0.0, abs=1e-9)
 
 
 @given(camera=CAMERAS, off_axis=st.floats(-1.2, 1.2))
@@ -80,13 +67,6 @@ def test_agrees_with_opencv(camera: PinholeCamera, off_axis: float) -> None:
     )
     azimuth = math.atan2(point[1], point[0])
     assert float(camera.column(azimuth)) == pytest.approx(pixels[0, 0, 0], rel=1e-6, abs=1e-3)
-
-
-def test_the_parallax_shift_is_computed() -> None:
-    camera = PinholeCamera.ovad()
-    for azimuth_deg, shift_deg in ((30.0, 1.5), (-30.0, 1.8)):
-        shift = abs(azimuth_deg - math.degrees(camera.off_axis(math.radians(azimuth_deg))))
-        assert shift == pytest.approx(shift_deg, abs=0.05)
 
 
 def test_behind_the_camera_is_in_no_column() -> None:

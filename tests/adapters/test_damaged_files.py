@@ -116,7 +116,7 @@ def read_each(name: str, folder: Path, seeds: range) -> int:
             READERS[name](folder / name)
         except WorldstateError as error:
             refused += 1
-            assert "\n" not in str(error), (seed, str(error))
+            assert str(folder) in str(error) and "\n" not in str(error), (seed, str(error))
         except BaseException as error:
             raise AssertionError(f"seed {seed}") from error
     return refused
@@ -188,10 +188,10 @@ def long_zip(path: Path) -> None:
         archive.writestr("a.npy", head.getvalue())
 
 
-def many_zip(path: Path, members: int = 100_000) -> None:
+def many_zip(path: Path) -> None:
     """Write npz with many members."""
     with zipfile.ZipFile(path, "w") as archive:
-        for number in range(members):
+        for number in range(100_000):
             archive.writestr(f"{number}.npy", b"")
 
 
@@ -394,22 +394,8 @@ def test_no_file_within_its_limit_takes_a_gigabyte(name, tmp_path):
     in_child(work, tmp_path / "report", 850 * MIB)  # 150 MiB are those of the library
 
 
-def test_arrays_are_measured_before_they_are_read(tmp_path: Path) -> None:
+def test_many_empty_streams_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "streams.npz"
-    save_tables(path, [HopTable({"time_s": np.zeros(3)}, name="a")])
-    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("more.npy", "w") as member:
-        header = {"descr": "|i1", "fortran_order": False, "shape": (70_000_000,)}
-        np.lib.format.write_array_header_1_0(member, header)
-        member.write(bytes(1000))
-    with pytest.raises(InputFileError, match="at most 512 MiB"):
-        load_streams(path)
-
-
-def test_many_members_and_many_empty_streams_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "streams.npz"
-    many_zip(path, 2000)
-    with pytest.raises(InputFileError, match="short list of members"):
-        load_streams(path)
     save_tables(path, [HopTable({"time_s": np.zeros(0)}, name="a")] * 100_001)
     with pytest.raises(InputFileError, match="at most 100000 tables"):
         load_streams(path)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from worldstate.adapters.camera.class_names import class_name, may_be
@@ -133,25 +133,6 @@ def test_blanks_and_further_keys_do_not_matter_and_a_list_is_needed(tmp_path: Pa
     for rate_hz in (0.0, float("nan"), 1e6):
         with pytest.raises(InvalidArgumentError, match="frame_rate_hz"):
             read_detections(tmp_path / "no.json", rate_hz)
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from([*GOOD, "stamp_ns"]), inner),
-    max_leaves=25,
-)
-
-
-@pytest.mark.long
-@given(rows=st.lists(JSON, max_size=3))
-@settings(max_examples=150, deadline=None)
-def test_any_json_as_detections(tmp_path_factory: pytest.TempPathFactory, rows: list[Any]) -> None:
-    name = tmp_path_factory.mktemp("json") / "d.json"
-    name.write_text(frames(*rows))
-    try:
-        assert len(read_detections(name)) <= len(rows)  # of equal stamps one counts
-    except InputFileError as error:
-        assert str(error).startswith(f"{name}: ")
 
 
 BAD_YOLO = [

@@ -79,11 +79,6 @@ def test_both_backgrounds_have_the_same_smallest_contrast(background, step, seen
     assert bool(len(detector.detect(there))) is seen
 
 
-def test_motion_sees_nothing_in_an_empty_street():
-    detector = MotionDetector()
-    assert sum(len(detector.detect(frame)) for frame in street(15, car=False)) == 0
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("background", ["mog2", "knn"])
 def test_light_is_no_object_however_much_of_the_image_it_changes(background, monkeypatch):

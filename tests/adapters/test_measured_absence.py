@@ -16,8 +16,6 @@ from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.camera_health import (
     FAMILIES,
-    LEVELS,
-    STRENGTHS,
     HealthMonitor,
     darkness_of,
     degrade,
@@ -94,12 +92,6 @@ def test_degradation_is_estimated_from_another_image(health, family, d, seed):
     assert asdict(seen)[family] == pytest.approx(d, abs=0.1)
     others = [level for name, level in asdict(seen).items() if name != family]
     assert max(others) <= 0.3
-
-
-def test_the_estimate_grows_with_the_degradation(health):
-    for family in STRENGTHS:
-        seen = [health.estimate(image_quality(degraded(GREY, family, d))) for d in LEVELS]
-        assert (np.diff([asdict(one)[family] for one in seen]) > 0.1).all()
 
 
 def test_the_reference_follows_dusk_but_not_a_dirty_lens(health):

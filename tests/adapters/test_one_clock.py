@@ -105,13 +105,6 @@ def test_stamps_in_another_unit_are_refused(sound: Path, unit: str, first_s: flo
         heard(sound, detections=log)
 
 
-@pytest.mark.parametrize("by", [1e3, 1e6])
-def test_odometry_in_another_unit_is_refused(sound: Path, by: float) -> None:
-    told = tuple(Odometry("wheels", nanoseconds(0.1 * i * by), 0.1) for i in range(201))
-    with pytest.raises(InputFileError, match=r"wheels: expected stamps in nanoseconds, times in seconds"):
-        heard(sound, odometry=OdometryLog(told))
-
-
 @pytest.mark.parametrize(
     ("first_s", "last_s", "told"),
     [(0.0, 20.0, ""), (-3.0, 22.0, ""), (4.0, 19.0, ""), (15.0, 35.0, "cover 5.0 of its 20.0 s"),

@@ -53,13 +53,6 @@ def test_a_moving_car_is_found_in_its_sector_and_nowhere_else(first_px, step_px,
             assert isinstance(asked.ask(stamp_ns, bearing(azimuth)), Present) is found
 
 
-def test_a_parked_car_is_a_sighting_and_an_absence() -> None:
-    asked = query(crossing(900.0, 0.0))
-    (seen,) = asked.sightings(NOW)
-    assert not seen.moving
-    assert isinstance(asked.ask(NOW, bearing(seen.azimuth_rad)), Absent)
-
-
 def test_only_the_expected_class_counts() -> None:
     keep = DetectionFilter(labels={"car", "bicycle"})
     asked = query(crossing(700.0, 20.0, label="bicycle"), keep=keep)

@@ -21,8 +21,7 @@ from worldstate.belief.street_model import StreetModel
 from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.settings import FrontEndSettings, default_span_deg
-from worldstate.frontend.stream import FrontEnd
+from worldstate.frontend.settings import default_span_deg
 from worldstate.ground import NotUsable, wrap_angle
 from worldstate.measurement import Bearing, Measurement
 from worldstate.simulation.emitters.syntheses import voice
@@ -215,10 +214,3 @@ def test_the_search_sector_follows_the_array_without_a_model() -> None:
     assert spans == [(-180.0, 180.0), (-90.0, 90.0)]
     with_model = Listener("respeaker-4", RATE)
     assert with_model._source.settings.azimuth_span_deg == 180.0
-
-
-def test_a_frame_flags_bearings_at_the_edge() -> None:
-    front_end = FrontEnd(MicrophoneArray(LINE), RATE, FrontEndSettings.heard_at(RATE))
-    frames = front_end.process(np.random.default_rng(0).normal(0.0, 0.1, (2 * RATE, 4)))
-    ends = [frame.bearing_rad in (frame.azimuths_rad[0], frame.azimuths_rad[-1]) for frame in frames]
-    assert [frame.at_edge for frame in frames] == ends

@@ -127,15 +127,6 @@ def test_a_former_command_is_refused_with_its_successor(former, capsys):
     assert " ".join(words) in programs[program].commands
 
 
-def test_a_card_needs_no_further_word(tmp_path, capsys):
-    save_model(tmp_path / "mine.json", read_model())
-    cards = []
-    for words in (["model", "show"], ["model", "show", str(tmp_path / "mine.json")]):
-        assert main(words) == 0
-        cards.append(capsys.readouterr().out)
-    assert len({card.partition("threshold")[2] for card in cards}) == 1
-
-
 def test_a_card_names_each_source_by_use_with_its_licence_none_stated_included(tmp_path, capsys):
     sources = (DataSource("some windows", "coefficients"), DataSource("some clips", "thresholds", "CC0"))
     made = read_model()

@@ -238,16 +238,6 @@ def test_a_second_run_with_the_same_log_raises_an_error(tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["log.jsonl"]
 
 
-@pytest.mark.long
-def test_one_of_two_simultaneous_runs_writes_every_state(street, tmp_path):
-    script = [*COMMAND, *played(street, "--out", tmp_path / "s.jsonl", "--duration", 6, "--speed", 3)]
-    pair = [subprocess.Popen(script, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) for _ in range(2)]
-    told = [one.communicate(timeout=120)[1].decode() for one in pair]
-    assert sorted(one.returncode for one in pair) == [0, 2], told
-    assert sum("another run writes to it" in one for one in told) == 1
-    assert len((tmp_path / "s.jsonl").read_text().splitlines()) == 51
-
-
 def test_files_of_others_are_not_overwritten(tmp_path):
     path = tmp_path / "log.jsonl"
     (tmp_path / "log.1.jsonl").write_text("of the user")

@@ -12,22 +12,17 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from bag_messages import CHANNELS, RATE_HZ, bag_of, block, blocks, info, moved, read_bag, sound_of
-from damaged_files import damaged
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.files.array_file import read_array
-from worldstate.adapters.files.odometry_file import OdometryLog
-from worldstate.adapters.listener import listen_steps
 from worldstate.adapters.ros.bag_input import needed_array
 from worldstate.adapters.ros.message_types import header
-from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
 from worldstate.frontend import MicrophoneArray
 from worldstate.ground.errors import InputFileError
-from worldstate.measurement.odometry import Odometry
 
 
 def heard(path: Path, channels: int | None = CHANNELS) -> np.ndarray:
@@ -274,15 +269,6 @@ def test_a_lost_message_becomes_silence_and_a_long_gap_an_error(tmp_path, caplog
 LINE = MicrophoneArray([[0, y, 0] for y in (0.1, 0.05, -0.05, -0.1)])
 
 
-def test_states_have_the_speed_of_the_ego(tmp_path):
-    path = bag_of(tmp_path / "bag", blocks(sound_of(2 * RATE_HZ)))
-    told = tuple(Odometry("wheels", 5_000_000_000 + k * 250_000_000, 2.0 * k) for k in range(9))
-    bare = ListenSettings(uncalibrated=True)
-    source = open_source(read_bag(path).sound, array=LINE, odometry=OdometryLog(told), settings=bare)
-    said = {step.state.stamp_ns: step.state.context.ego_speed_mps for step in listen_steps(source)}
-    assert said == {6_000_000_000 + k * 100_000_000: 2.0 * int(4 + 0.4 * k) for k in range(11)}
-
-
 def test_wrong_topics_raise_an_error_with_the_topics(tmp_path, capsys):
     samples = sound_of(2 * RATE_HZ)
     bad = samples.copy()
@@ -323,28 +309,6 @@ def test_wrong_topics_raise_an_error_with_the_topics(tmp_path, capsys):
         assert said in " ".join(capsys.readouterr().err.split()), (name, options)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3", "signed_16", "pcm-s16"])
-def test_a_damaged_bag_raises_an_error_with_its_name(tmp_path, storage):
-    samples = sound_of(RATE_HZ)
-    if storage in KINDS:
-        foreign_bag(tmp_path / "whole", samples, storage)
-    else:
-        bag_of(tmp_path / "whole", blocks(samples), storage)
-    (good,) = (file for file in (tmp_path / "whole").iterdir() if file.suffix != ".yaml")
-    content, rng, refused = good.read_bytes(), np.random.default_rng(3), 0
-    spoilt = tmp_path / f"damaged{good.suffix}"
-    for _ in range(40):
-        spoilt.write_bytes(damaged(content, rng))
-        try:
-            with open_sound(read_bag(spoilt).sound, strict=False) as audio:
-                list(audio.blocks())
-        except InputFileError as error:
-            refused += 1
-            assert str(error).startswith(str(spoilt))
-    assert refused >= 20
-
-
 @pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
 def test_compressed_bags_raise_an_error(tmp_path, mode):
     said = bag_of(tmp_path / "bag", blocks(sound_of(RATE_HZ)), "sqlite3") / "metadata.yaml"
@@ -380,13 +344,3 @@ def test_a_wrong_index_of_an_mcap_raises_an_error(tmp_path, first_ns, last_ns):
     file.write_bytes(data)
     with pytest.raises(InputFileError, match="expected an index with the times of its messages"):
         read_bag(file)
-
-
-def test_bag_metadata_is_parsed_once_more_than_by_rosbags(tmp_path, monkeypatch):
-    from ruamel.yaml import YAML
-
-    path, parsed, load = bag_of(tmp_path / "bag", blocks(sound_of(RATE_HZ))), [], YAML.load
-    monkeypatch.setattr(YAML, "load", lambda yaml, text: parsed.append(text) or load(yaml, text))
-    assert len(heard(path)) == RATE_HZ
-    opened = 4  # for the stamps of its sound, for the other topics, for its first second, and for its blocks
-    assert len(parsed) == opened + 1
