@@ -13,6 +13,7 @@ from worldstate_lab.cli.main import main as study
 from worldstate.adapters.datasets.ovad import DETECTION_NAMES, Recording
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.demo import simulate_approach
+from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import ovad_array
 
 # Two processes share two cores with other work, so the duration of an example is not a property of the code.
@@ -78,6 +79,17 @@ def street(tmp_path_factory) -> Path:
     lens = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
     (folder / "lens.json").write_text(json.dumps(lens))
     return folder
+
+
+@pytest.fixture
+def refused(capsys):
+    """Return a function that runs a command, which must fail, and returns its error."""
+
+    def error_of(words):
+        assert main(words) == 2
+        return capsys.readouterr().err
+
+    return error_of
 
 
 @pytest.fixture(scope="session")

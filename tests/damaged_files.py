@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 from bag_messages import RATE_HZ, bag_of, blocks, sound_of
-from scripted_states import scripted_states
+from scripted_states import scripted_states, write_states
 
 from worldstate import WorldFilter, WorldState
 from worldstate.abduction.signature.site_estimate import SiteEstimate
@@ -156,7 +156,7 @@ def _write_boxes(folder: Path) -> None:
 
 def _write_logs(folder: Path) -> None:
     states = [WorldState(stamp_ns, 0) for stamp_ns in (0, 10**8)] + scripted_states()[2:4]
-    (folder / "states.jsonl").write_text("".join(state.to_json() + "\n" for state in states))
+    write_states(folder / "states.jsonl", states)
     with mcap_file(folder / "states.mcap") as write:
         for state in states:
             for message in state_messages(state):

@@ -1,6 +1,7 @@
 """Snapshots of a short scripted approach: hidden on the left, then visible, then with a position."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from street_measurements import hop, reading
@@ -30,6 +31,12 @@ def scripted_states(hops: int = 5) -> list[WorldState]:
         world = world.update(hop(number, answer=look.answer, look=look, sequence=said))
         states.append(replace(world.state, ego=EGO))
     return [*states[1:], *_in_view(states[-1])]
+
+
+def write_states(path: Path, states: list[WorldState]) -> Path:
+    """Write snapshots as JSON lines."""
+    path.write_text("".join(state.to_json() + "\n" for state in states))
+    return path
 
 
 def _in_view(last: WorldState) -> list[WorldState]:

@@ -10,32 +10,19 @@ import pytest
 from camera_boxes import EMPTY, boxed
 from made_up_sound import Fixed, plane_wave
 
+from worldstate import MicrophoneArray, NotUsable, WorldFilter, WorldState
+from worldstate.abduction import DomainGuard, Familiar, Foreign
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
-from worldstate.abduction.road_users import (
-    DomainGuard,
-    Familiar,
-    Foreign,
-    RoadUserModel,
-    WarningSignal,
-    expected_labels,
-    heard_kinds,
-)
-from worldstate.adapters import acoustic
+from worldstate.abduction.road_users import RoadUserModel, WarningSignal, expected_labels, heard_kinds
+from worldstate.adapters import DetectionFilter, DetectionLog, PinholeCamera, VisionQuery, acoustic
 from worldstate.adapters.acoustic import FOREIGN, AcousticAdapter, asked_again
-from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog
-from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Tracks, heard_as
-from worldstate.core.filter import WorldFilter
-from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
 from worldstate.ground.errors import OutOfDomainError
-from worldstate.ground.values import NotUsable
 from worldstate.measurement.measurement import Approach, Bearing, Heard, Measurement
-from worldstate.state.world_state import WorldState
 
 RATE_HZ = 16_000
 ARRAY = MicrophoneArray(

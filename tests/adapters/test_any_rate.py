@@ -10,20 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import firwin, resample_poly
 
+from worldstate.adapters import ListenSettings, Model, Step, listen_steps, open_source, read_model
 from worldstate.adapters.audio.sound_file import RawPcm, SoundInput
 from worldstate.adapters.files.acoustic_domain import domain_of
-from worldstate.adapters.files.model_file import Model, read_model
-from worldstate.adapters.listener import Step, listen_steps
-from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.commissioning.commission import commission
 from worldstate.commissioning.heard_stream import CommissionSettings, quick_settings
-from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.frontend.stream import AcousticFrame, FrontEnd
+from worldstate.frontend import AcousticFrame, FrontEnd, MicrophoneArray, ovad_array
 from worldstate.ground import wrap_angle
 from worldstate.ground.typing import Float32Array
 from worldstate.measurement.measurement import Bearing
-from worldstate.simulation.dataset.recording import simulate_recording
-from worldstate.simulation.scene.settings import draw_settings
+from worldstate.simulation import draw_settings, simulate_recording
 
 FULL_HZ = 48_000
 RATES = (8_000, 11_025, 16_000, 22_050, 32_000, 44_100, 96_000)

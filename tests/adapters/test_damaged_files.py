@@ -20,20 +20,16 @@ import zstandard
 from camera_boxes import write_onnx
 from damaged_files import RATE_HZ, spoilt, write_inputs
 
+from worldstate.adapters import load_miss_rates, open_onnx, read_camera, read_checkpoint, read_model
 from worldstate.adapters.audio.sound_file import open_audio, open_sound
 from worldstate.adapters.camera.detections import read_any_detections, read_mot_text
-from worldstate.adapters.camera.detectors import open_onnx
-from worldstate.adapters.camera.miss_rates import load_miss_rates
-from worldstate.adapters.camera.pinhole import read_camera
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.datasets.ovad import OvadDataset, read_true_tracks
 from worldstate.adapters.export.log_messages import SNAPSHOT_TOPIC, read_messages
 from worldstate.adapters.files.array_file import read_array, write_array_xml
-from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.files.context_file import read_context
 from worldstate.adapters.files.file_io import atomic_path, write_text
-from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.files.odometry_file import read_odometry
 from worldstate.adapters.ros.bag_input import read_sound
 from worldstate.adapters.state_log import read_log, read_state_near

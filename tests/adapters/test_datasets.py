@@ -12,18 +12,11 @@ from made_up_sound import THREE
 from released_data import FOLDER
 from scipy.signal import resample_poly
 
+from worldstate.adapters import OvadDataset, write_array_xml
 from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, read_features, read_ids
-from worldstate.adapters.datasets.ovad import (
-    DETECTION_NAMES,
-    OvadDataset,
-    Recording,
-    choose_array,
-    read_true_tracks,
-)
-from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters.datasets.ovad import DETECTION_NAMES, Recording, choose_array, read_true_tracks
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.frontend.direction.feature import published_feature
+from worldstate.frontend import MicrophoneArray, published_feature
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 RATE = 16_000

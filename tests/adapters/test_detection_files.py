@@ -11,13 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from worldstate.adapters import read_any_detections
 from worldstate.adapters.camera.class_names import class_name, may_be
-from worldstate.adapters.camera.detections import (
-    read_any_detections,
-    read_detections,
-    read_mot_text,
-    read_yolo_text,
-)
+from worldstate.adapters.camera.detections import read_detections, read_mot_text, read_yolo_text
 from worldstate.adapters.files.odometry_file import read_odometry
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
@@ -73,16 +69,13 @@ REFUSED = [
     (frames({"boxes": [], "scores": []}), r"frame 0\.classes_str: expected a list .*, got None"),
     (frames({**GOOD, "scores": []}), "frame 0: expected as many of each, .*1 boxes, 0 scores"),
     (frames({**GOOD, "boxes": [[0, 0, 10]]}), r"boxes_px: expected shape \(1, 4\), got \(1, 3\)"),
-    (frames({**GOOD, "boxes": [["0", "0", "1", "2"]]}), "expected a finite number, got '0'"),
     (frames({**GOOD, "boxes": [[0, 0, True, 2]]}), r"boxes\[0\]\[2\]: expected a finite number, got True"),
-    (frames({**GOOD, "boxes": [[0, 0, None, 2]]}), "expected a finite number, got None"),
     (frames({**GOOD, "boxes": [[10, 0, 0, 20]]}), "x1 <= x2"),
     (frames({**GOOD, "scores": [1.5]}), r"boxes\[0\]: .* scores in \[0, 1\], got .* with 1\.5"),
     (frames({**GOOD, "classes_str": [3]}), r"classes_str\[0\]: expected text, got 3"),
     (frames(GOOD, {**GOOD, "scores": [float("nan")]}), "NaN is not a JSON"),
     (frames({**GOOD, "boxes": [[0, 0, float("inf"), 2]]}), "Infinity is not a JSON"),
     (frames(GOOD).replace("20", "1e999"), r"boxes\[0\]\[3\]: expected a finite number"),
-    (frames(GOOD).replace("20", "2" * 4000), r"boxes\[0\]\[3\]: expected a finite number"),
     (frames(GOOD).replace("20", "2" * 5000), "expected JSON"),
     (frames({key: value * 1001 for key, value in GOOD.items()}), "at most 1000"),
     (frames(GOOD | {"stamp_ns": 5}, GOOD), "frame 1: expected stamp_ns, as in other frames"),
@@ -93,8 +86,6 @@ REFUSED = [
     ),
     # Files whose images are read one by one.
     ('{"detections_per_frame": [%s %s]}', "frame 1: expected JSON"),
-    ('{"detections_per_frame": [%s, %s,]}', "frame 2: expected JSON"),
-    ('{"detections_per_frame": [%s, %s]', "expected JSON"),
     ('{"detections_per_frame": [%s, %s]} {}', "expected JSON"),
     ('{"note": {"detections_per_frame": [%s, %s]}}', "expected an object with a list"),
     ('{"detections_per_frame": [%s, %s, [[[]]]]}', "frame 2: expected an object"),

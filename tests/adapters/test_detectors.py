@@ -8,16 +8,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
 
+from worldstate.adapters import MotionDetector, OnnxDetector
 from worldstate.adapters.camera import detectors
 from worldstate.adapters.camera.box_linking import overlaps
-from worldstate.adapters.camera.detectors import (
-    MotionDetector,
-    OnnxDetector,
-    decode_yolo,
-    open_onnx,
-    outlined_share,
-    suppress,
-)
+from worldstate.adapters.camera.detectors import decode_yolo, open_onnx, outlined_share, suppress
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 boxes = st.lists(

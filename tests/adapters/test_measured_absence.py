@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 from street_frames import HEIGHT, WIDTH, reference, street
 
-from worldstate.abduction.co_evidence import Absent, Present
+from worldstate import Absent, PinholeCamera, Present, nanoseconds
+from worldstate.adapters import DetectionLog, MotionDetector, VisionQuery, open_video
 from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.camera_health import (
     FAMILIES,
@@ -23,22 +24,13 @@ from worldstate.adapters.camera.camera_health import (
     learn_health,
     strength,
 )
-from worldstate.adapters.camera.detections import DetectionLog
-from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates
-from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import open_video
-from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.cli.main import main
 from worldstate.ground.serialisation import decode
-from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
+from worldstate.operations import AbsenceSettings
 from worldstate.operations.detectors import miss_rate_measurement
-from worldstate.operations.detectors.miss_rate_measurement import (
-    AbsenceSettings,
-    LabelledVideo,
-    measure_absence,
-)
+from worldstate.operations.detectors.miss_rate_measurement import LabelledVideo, measure_absence
 
 GREY = next(street(1))
 

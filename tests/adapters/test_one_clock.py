@@ -11,15 +11,13 @@ import soundfile
 from camera_boxes import EMPTY, LENS, boxed, write_boxes
 from made_up_sound import THREE
 
-from worldstate import Listener
-from worldstate.abduction.co_evidence import Absent
+from worldstate import Absent, Listener, nanoseconds
 from worldstate.adapters import ListenSettings, PinholeCamera, Source, open_source
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_any_detections
 from worldstate.adapters.files.odometry_file import OdometryLog, read_odometry
 from worldstate.adapters.listener import listened
 from worldstate.frontend.array.microphone_array import ovad_array
-from worldstate.ground.errors import InputFileError
-from worldstate.ground.values import nanoseconds, seconds
+from worldstate.ground import InputFileError, seconds
 from worldstate.measurement import Bearing, Odometry
 
 ANYTHING, LENGTH_S = ListenSettings(uncalibrated=True), 20.0

@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 from camera_boxes import write_video
 from made_up_sound import plane_wave
-from scripted_states import scripted_states
+from scripted_states import scripted_states, write_states
 
-from worldstate.adapters import AcousticAdapter, write_array_xml
+from worldstate.adapters import AcousticAdapter, Detector, open_video, write_array_xml
 from worldstate.adapters.camera.box_linking import overlaps
-from worldstate.adapters.camera.detections import Detector
-from worldstate.adapters.camera.video import open_video
 from worldstate.adapters.live.live_sensors import ImageLooks, image_channel
 from worldstate.adapters.own_parts import OwnDetector, installed, of_part
 from worldstate.belief.street_model import StreetModel
@@ -62,9 +60,7 @@ def own_parts(package, monkeypatch):
 
 @pytest.fixture
 def log(tmp_path):
-    path = tmp_path / "states.jsonl"
-    path.write_text("".join(state.to_json() + "\n" for state in scripted_states()))
-    return path
+    return write_states(tmp_path / "states.jsonl", scripted_states())
 
 
 @pytest.mark.long
@@ -155,13 +151,12 @@ def installed_module(folder, name, text, entry):
     (info / "entry_points.txt").write_text(f"[worldstate.exporters]\n{entry}\n")
 
 
-def test_a_broken_plug_in_has_its_own_error(log, tmp_path, monkeypatch, capsys):
+def test_a_broken_plug_in_has_its_own_error(log, tmp_path, monkeypatch, refused):
     for name, text in (("broken", "raise RuntimeError('no licence')"), ("number", "export = 7")):
         installed_module(tmp_path, name, text, f"{name} = {name}:export")
     monkeypatch.syspath_prepend(tmp_path)
     for name, said in (("broken", "(RuntimeError: no licence)"), ("number", "to be callable, got 7")):
-        assert main(["log", "replay", str(log), "--export", f"{name}=x"]) == 2
-        assert said in capsys.readouterr().err
+        assert said in refused(["log", "replay", str(log), "--export", f"{name}=x"])
 
 
 RAISING = """

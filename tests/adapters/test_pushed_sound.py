@@ -11,12 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sound import THREE
 
-from worldstate import Listener, MicrophoneArray, Odometry, PinholeCamera
+from worldstate import Listener, ListenSettings, MicrophoneArray, Odometry, PinholeCamera
+from worldstate.adapters import Model, read_model, save_model, write_array_xml
 from worldstate.adapters.files.acoustic_domain import domain_of
-from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
-from worldstate.adapters.files.model_file import Model, read_model, save_model
-from worldstate.adapters.source import ListenSettings
 from worldstate.cli.main import main
 from worldstate.ground import InvalidArgumentError, nanoseconds
 from worldstate.ground.typing import Float32Array

@@ -11,7 +11,7 @@ import soundfile
 from made_up_sequence import sequence_model
 from made_up_sound import THREE
 
-from worldstate import Context, WorldState
+from worldstate import Context, Listener, ListenSettings, NotUsable, Odometry, WorldState
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
 from worldstate.abduction.road_users import neutral
 from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
@@ -19,18 +19,14 @@ from worldstate.abduction.sequence.sequence_model import AlarmCurve, SequenceAla
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.ensemble import EnsembleModel, Expert
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
+from worldstate.adapters import Step, listen_steps, open_source, read_checkpoint, save_checkpoint
 from worldstate.adapters.acoustic import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
-from worldstate.adapters.files.checkpoint_file import read_checkpoint, save_checkpoint
 from worldstate.adapters.files.model_file import KindShare, Model, read_model, save_model
-from worldstate.adapters.listener import Listener, Step, listen_steps
-from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.commissioning.commission import stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import encode
-from worldstate.ground.values import NotUsable
-from worldstate.measurement.odometry import Odometry
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.state import Hearing
 

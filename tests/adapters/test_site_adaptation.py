@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from worldstate.abduction.signature.site_estimate import SiteEstimate, SiteEstimateSettings, SiteSignature
-from worldstate.adapters.files.checkpoint_file import Checkpoint
-from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.source import ListenSettings, open_source
+from worldstate.adapters import Checkpoint, ListenSettings, open_source, read_model
 from worldstate.ground.errors import InvalidArgumentError
 
 MODEL, SLOPE = read_model().signature, np.tile(np.linspace(-1.0, 1.0, 30), 2)

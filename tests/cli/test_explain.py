@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from worldstate import Measurement, NotUsable, SignatureEvidence, WorldFilter, WorldState
-from worldstate.abduction.co_evidence import Absent
-from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
-from worldstate.abduction.road_users import Foreign
+from worldstate import Absent, Measurement, NotUsable, SignatureEvidence, WorldFilter, WorldState
+from worldstate.abduction import Foreign, uncalibrated_policy
 from worldstate.abduction.sequence.sequence_model import GROUPS, AlarmPromise, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.cli.main import main
@@ -177,20 +175,18 @@ def test_explain_prints_why_there_is_no_advisory(states, onset, capsys):
         ("--time nan", "--time"),
     ],
 )
-def test_wrong_times_and_sides_raise_an_error(words, said, states, capsys):
-    assert main(["explain", str(states), *words.split()]) == 2
-    assert said in capsys.readouterr().err
+def test_wrong_times_and_sides_raise_an_error(words, said, states, refused):
+    assert said in refused(["explain", str(states), *words.split()])
 
 
-def test_other_versions_and_empty_logs_raise_an_error(states, tmp_path, capsys):
+def test_other_versions_and_empty_logs_raise_an_error(states, tmp_path, capsys, refused):
     file = tmp_path / "old.jsonl"
     file.write_text(states.read_text().replace('"version":"4.2.0"', '"version":"2.1.0"'))
     assert main(["explain", str(file), "--time", "1"]) == 2
     assert "old.jsonl: expected schema worldstate.Snapshot 4.x, got" in (said := capsys.readouterr().err)
     assert "write it again" in said
     file.write_text("")
-    assert main(["explain", str(file), "--time", "1"]) == 2
-    assert "worldstate run --out" in capsys.readouterr().err
+    assert "worldstate run --out" in refused(["explain", str(file), "--time", "1"])
 
 
 def test_partial_logs_are_explained_and_replayed(states, onset, tmp_path, capsys):

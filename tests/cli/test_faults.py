@@ -18,8 +18,7 @@ import soundfile
 from damaged_files import damaged, write_inputs
 from scripted_states import scripted_states
 
-from worldstate.adapters.datasets.ovad import OvadDataset
-from worldstate.adapters.files.array_file import write_array_xml
+from worldstate.adapters import OvadDataset, write_array_xml
 from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common import progress
 from worldstate.cli.main import main

@@ -17,17 +17,10 @@ EMPTY = {"boxes": [], "scores": [], "classes_str": []}
 ASKED = {"detections_per_frame": [EMPTY] * 30}
 TRUCK = {"boxes": [[10.0, 200.0, 400.0, 600.0]], "scores": [0.4], "classes_str": ["truck"]}
 NOTHING = {"detections_per_frame": list[object]()}
-BOX = {"image_id": 0, "category_id": 3, "bbox": [10, 200, 400, 400], "score": 0.9}
 
 
 def odometry(*times_s: float) -> str:
     return "time_s,speed_mps\n" + "".join(f"{time_s},0\n" for time_s in times_s)
-
-
-def stamped(first_s: float, unit: float = 1e9) -> object:
-    return {
-        "detections_per_frame": [{**EMPTY, "stamp_ns": round((first_s + 0.1 * i) * unit)} for i in range(30)]
-    }
 
 
 def boxes(content: object) -> Mapping[str, object]:
@@ -45,18 +38,12 @@ CAMERAS = (
 # Inputs beside the sound: an option with the content of its file or its words, and the printed line.
 SILENT: dict[str, tuple[Mapping[str, object], str]] = {
     "boxes of no image": (boxes(NOTHING), "searched no image"),
-    "results of no box": (boxes([]), "searched no image"),
-    "a list of no image": (boxes({"images": [], "annotations": []}), "searched no image"),
     "one image listed": (boxes({"images": [{"id": 0}], "annotations": []}), "1 of 1 stamps"),
     "MOTChallenge text, empty": ({"--detections d.txt": ""}, "searched no image"),
     "boxes that do not count": (
         boxes({"detections_per_frame": [TRUCK] + [EMPTY] * 29}),
         "none of its boxes has counted yet",
     ),
-    "boxes of another day": (boxes(stamped(86_400.0)), "stamp_offset_s"),
-    "boxes in milliseconds": (boxes(stamped(0.0, 1e3)), "in another unit"),
-    "boxes of an hour before": (boxes([{**BOX, "image_id": 36_000}]), "image_rate_hz"),
-    "boxes of the last hop": (boxes(stamped(2.9)), "of 30 stamps lie within the sound"),
     "a camera alone": ({"--camera c.json": LENS}, "--camera without --detections"),
     "a camera of a car alone": (car(cameras=[FRONT]), "cameras of --car without"),
     "an empty car": (car(), "no array, camera, model, odometry or measurements"),
@@ -64,13 +51,7 @@ SILENT: dict[str, tuple[Mapping[str, object], str]] = {
     "one of two cameras": (car(cameras=CAMERAS), "rear: the detector searched no image"),
     "an empty context": ({"--context x.json": {}}, "it is empty"),
     "odometry, empty": ({"--odometry o.csv": odometry()}, "at least one line"),
-    "odometry of another day": (
-        {"--odometry o.csv": odometry(86_400.0, 86_400.1)},
-        "on the clock of the sound",
-    ),
-    "odometry of the last hop": ({"--odometry o.csv": odometry(2.99)}, "1 of 1 stamps lie within the sound"),
     "odometry in milliseconds": ({"--odometry o.csv": odometry(*range(0, 3000, 100))}, "in another unit"),
-    "a topic without a bag": ({"--topic": "detections=/boxes"}, "topics: expected a bag"),
     "sound that was heard before": ({"--resume state.json": None}, "all of this sound was used before"),
 }
 

@@ -8,29 +8,25 @@ from functools import partial
 
 import numpy as np
 import pytest
+from camera_boxes import EMPTY, boxed
 from stand_ins import send, wall
 
-from worldstate.abduction.co_evidence import Absent, Present, Unqueried
-from worldstate.adapters.audio.sound_file import RawPcm
-from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog
-from worldstate.adapters.camera.pinhole import PinholeCamera
+from worldstate import Absent, DetectionFrame, PinholeCamera, Present, Unqueried, nanoseconds
+from worldstate.adapters import DetectionLog, RawPcm, open_source
 from worldstate.adapters.camera.vision_query import NO_LOOKS, REMEMBERED, VisionQuery
 from worldstate.adapters.live.live_sensors import CameraFeed, DetectionSocket, ImageLooks, image_channel
 from worldstate.adapters.own_parts import OwnDetector
-from worldstate.adapters.source import open_source
 from worldstate.core.memory import MOST_BOXES
 from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.ground.errors import InputFileError, OwnPartError
-from worldstate.ground.values import nanoseconds
 from worldstate.measurement.measurement import Bearing
 
 CAMERA = PinholeCamera.ovad(width_px=640, height_px=480, position_m=(0.0, 0.0, 0.0), pitch_rad=0.0)
 AHEAD, IMAGE = Bearing(0.0, 0.05), np.zeros((480, 640, 3), np.uint8)
-EMPTY = DetectionFrame(np.empty((0, 4)), np.empty(0), ())
 
 
 def box(left_px):
-    return DetectionFrame(np.array([[left_px, 100.0, left_px + 120.0, 300.0]]), np.array([0.9]), ("car",))
+    return boxed((left_px, 100.0, left_px + 120.0, 300.0))
 
 
 def stamp(number):

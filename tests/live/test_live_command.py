@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import soundfile
+from camera_boxes import LENS
 from rich.console import Console
 from stand_ins import free_port, played, sending, wall
 
@@ -21,7 +22,6 @@ from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.common.live_view import view_of
 from worldstate.cli.main import main
 
-LENS = {"width_px": 640, "height_px": 480, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}
 NO_BOXES = json.dumps({"boxes": [], "scores": [], "classes_str": [], "age_s": 0.02}).encode()
 
 
@@ -38,7 +38,7 @@ def report_of(words, capsys):
     return json.loads(capsys.readouterr().out)
 
 
-def test_live_has_the_states_of_run_and_keeps_sound_on_request_only(street, tmp_path, capsys):
+def test_live_has_the_states_of_run_and_keeps_sound_on_request_only(street, tmp_path, capsys, refused):
     live, run, kept = tmp_path / "live" / "states.jsonl", tmp_path / "run.jsonl", tmp_path / "kept.wav"
     live.parent.mkdir()
     report = report_of(played(street, "--speed", 4, "--out", live), capsys)
@@ -54,8 +54,7 @@ def test_live_has_the_states_of_run_and_keeps_sound_on_request_only(street, tmp_
     heard, rate_hz = soundfile.read(kept)
     assert rate_hz == 8000
     np.testing.assert_array_equal(heard, soundfile.read(street / "street.wav")[0])
-    assert main(played(street, "--keep-sound", street / "street.wav")) == 2
-    assert "this one is an input" in capsys.readouterr().err
+    assert "this one is an input" in refused(played(street, "--keep-sound", street / "street.wav"))
 
 
 def test_losses_are_reported_when_they_happen(street, capsys, monkeypatch):
@@ -117,26 +116,20 @@ def car_file(folder, street, **more):
     return ["--car", str(folder / "car.json"), "--uncalibrated"]
 
 
-def test_several_cameras_are_queried(street, tmp_path, capsys):
+def test_several_cameras_are_queried(street, tmp_path, capsys, refused):
     yaws = {"front": 0.0, "aside": 60.0}
     cameras = [{"name": name, **LENS, "yaw_deg": yaw} for name, yaw in yaws.items()]
     states, ports = tmp_path / "states.jsonl", [free_port(), free_port()]
     told = [f"--detections={name}=127.0.0.1:{port}" for name, port in zip(yaws, ports, strict=True)]
-    words = [
-        "live",
-        "--play",
-        str(street / "street.wav"),
-        *car_file(tmp_path, street, cameras=cameras),
-        *told,
-    ]
+    car = car_file(tmp_path, street, cameras=cameras)
+    words = ["live", "--play", str(street / "street.wav"), *car, *told]
     outside = {"boxes": [[5000, 100, 5120, 300]], "scores": [0.9], "classes_str": ["car"]}
     with sending(ports[0], NO_BOXES), sending(ports[1], NO_BOXES, json.dumps(outside).encode()):
         report = report_of([*words, "--out", str(states)], capsys)
     assert report["detections_refused"] > 0
     assert "640 x 480 px" in report["last_refusal"]
     assert looked_at(states) == {"front", "aside"}
-    assert main([*words, "--detections", "back=127.0.0.1:0"]) == 2
-    assert "camera: expected one of front, aside" in capsys.readouterr().err
+    assert "camera: expected one of front, aside" in refused([*words, "--detections", "back=127.0.0.1:0"])
 
 
 @pytest.mark.parametrize("command", [["live", "--speed", "20", "--play"], ["run"]])

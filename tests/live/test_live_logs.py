@@ -44,13 +44,21 @@ def stamps_s(path):
     return [state.stamp_ns / 1e9 for _, state in read_log(path)]
 
 
-def check_killed(street, folder, seed, hops=(15, 60)):
-    """Kill a run up to 0.1 s after one of its states; check its files."""
-    folder.mkdir()
+# Most of the runs are slow; every fourth is killed after its belief was saved once or twice.
+KILLED = [
+    pytest.param(seed, (15, 60) if seed % 4 else (650, 1300), marks=[pytest.mark.slow] * (seed not in (1, 2)))
+    for seed in range(20)
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("seed", "hops"), KILLED)
+def test_a_killed_run_leaves_readable_files(street, tmp_path, seed, hops):
+    """A run is killed up to 0.1 s after one of its states."""
     rng = random.Random(seed)
     after_states, wait_s = rng.randint(*hops), rng.uniform(0.0, 0.1)
-    endless = words(street, folder, "--duration", 86_400, "--speed", 3 if after_states < 100 else 30)
-    states, mcap, sound, belief = (folder / name for name in NAMES)
+    endless = words(street, tmp_path, "--duration", 86_400, "--speed", 3 if after_states < 100 else 30)
+    states, mcap, sound, belief = (tmp_path / name for name in NAMES)
     with subprocess.Popen([*COMMAND, *endless], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         until_s = time.monotonic() + 120.0
         while time.monotonic() < until_s and process.poll() is None:
@@ -65,23 +73,10 @@ def check_killed(street, folder, seed, hops=(15, 60)):
     assert stamps_s(mcap)[-1] > written_s - 1.0
     assert len(soundfile.read(sound)[0]) / RATE > written_s - 1.0
     for log in (states, mcap):
-        assert main(["log", "replay", str(log), "--out", str(folder / "again.jsonl")]) == 0
-    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+        assert main(["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")]) == 0
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
     if written_s > 62.0:
         assert 0.0 <= written_s - read_checkpoint(belief).world.stamp_ns / 1e9 <= 61.0
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_killed_run_leaves_readable_files(street, tmp_path, seed):
-    check_killed(street, tmp_path / "run", seed)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(20))
-def test_a_run_killed_at_twenty_times_leaves_readable_files(street, tmp_path, seed):
-    # Every fourth run is killed after its belief was saved once or twice.
-    check_killed(street, tmp_path / "run", seed, (15, 60) if seed % 4 else (650, 1300))
 
 
 @pytest.mark.long
@@ -132,17 +127,6 @@ def test_the_belief_is_saved_every_minute_and_at_an_error(street, tmp_path, monk
     assert seen
     assert all(0 < now_ns - saved_ns <= 500_000_000 for now_ns, saved_ns in seen)
     assert read_checkpoint(belief).world.stamp_ns >= 1_500_000_000
-
-
-def test_a_full_log_continues_in_a_new_file(tmp_path):
-    path = tmp_path / "log.jsonl"
-    with line_writer(path, partial(GrowingFile, most_bytes=100)) as write:
-        for number in range(60):
-            write(f'{{"number": {number:>10}}}')
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["log.1.jsonl", "log.jsonl"]
-    assert max(one.stat().st_size for one in tmp_path.iterdir()) < 150
-    lines = [*(tmp_path / "log.1.jsonl").read_text().splitlines(), *path.read_text().splitlines()]
-    assert [json.loads(line)["number"] for line in lines] == list(range(60 - len(lines), 60))
 
 
 def test_records_after_a_full_disk_follow_the_last_whole_one(tmp_path, caplog):

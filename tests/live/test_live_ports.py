@@ -15,20 +15,15 @@ from pathlib import Path
 import pytest
 from stand_ins import free_port, played, send, sending
 
-from worldstate.adapters.files.checkpoint_file import (
-    Checkpoint,
-    PortNumbers,
-    read_checkpoint,
-    save_checkpoint,
-)
+from worldstate import WorldFilter, nanoseconds
+from worldstate.adapters import Checkpoint
+from worldstate.adapters.files.checkpoint_file import PortNumbers, read_checkpoint, save_checkpoint
 from worldstate.adapters.live import live_sensors
 from worldstate.adapters.live.live_sensors import DetectionSocket, OdometrySocket, Trust
 from worldstate.adapters.state_log import read_log
 from worldstate.cli.live import _trust
 from worldstate.cli.main import main
-from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.values import nanoseconds
 
 SECRET = b"sixteen bytes or more"
 LOOK = {"boxes": [], "scores": [], "classes_str": []}

@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_boxes import EMPTY
 from snapshot_laws import broken_laws
 from stand_ins import free_port, send
 
-from worldstate.adapters.camera.detections import DetectionFrame
+from worldstate import Odometry
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.live import live_listening
 from worldstate.adapters.live.live_sensors import ImageLooks, _code, image_channel, signed
 from worldstate.adapters.live.live_sound import SoundBlock
 from worldstate.adapters.state_log import read_log
 from worldstate.cli.main import main
-from worldstate.measurement.odometry import Odometry
 
 RATE, BLOCK, HOP_NS = 8_000, 200, 100_000_000
 LONG_S = float(os.environ.get("WORLDSTATE_SOAK_S", "3600"))
@@ -45,7 +45,6 @@ RANGES = (
 )  # fmt: skip
 SPEEDS = ({"speed_mps": 1e30}, {"speed_mps": float("nan")}, {"speed_mps": 1, "x_m": 3}, {"speed_mps": None})
 SAMPLES = np.nan, np.inf, -1e30, 1e6, 0.5
-EMPTY = DetectionFrame(np.zeros((0, 4)), np.zeros(0), ())
 # Wrong values of a user's callback in place of boxes, and right ones.
 GIVEN = None, RuntimeError("a detector that fails"), "boxes", EMPTY
 
