@@ -39,6 +39,14 @@ def _chances(state: WorldState) -> Iterator[str]:
             yield f"P(hidden) {one.hidden_probability} of an existence of {one.existence_probability}"
         if abs(one.azimuth_rad) > math.pi or one.azimuth_std_rad <= 0.0:
             yield f"an azimuth of {one.azimuth_rad} +- {one.azimuth_std_rad}"
+        if abs(math.fsum(kind.probability for kind in one.classification) - 1.0) > 1e-6:
+            yield f"classes that do not sum to one: {one.classification}"
+        hidden = one.status == "hidden"
+        if (one.sector_rad is not None) != hidden:
+            yield f"{one.status} with a sector of {one.sector_rad}"
+        heard_only = hidden and one.sources == ("acoustic",) and one.last_seen_ns is None
+        if (heard_only and one.forecast) or not (hidden or one.forecast):
+            yield f"{one.status} with a forecast of {one.forecast}"
     if len(state.entities) > 128 or len(state.events) > 64:
         yield "more entities or events than a snapshot holds"
     names = {one.id for one in (*state.entities, *state.context.occluders)} | {"ego"}

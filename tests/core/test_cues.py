@@ -100,6 +100,9 @@ def test_evidence_terms_of_windows_sum_to_the_log_odds(seed: int) -> None:
             higher = StreetModel().beside_nats * just_come
             assert cue.evidence.threshold_nats == pytest.approx(math.log(9.0) + higher)
             assert looked or terms["looks"] == pytest.approx(0.0, abs=1e-9)
+            right, left = cue.sector_rad
+            assert right < cue.azimuth_rad < left
+            assert left - right == pytest.approx(2.0 * 1.6448536 * cue.azimuth_std_rad, abs=2e-6)
             two |= abs(terms["looks"]) > 0.01
     assert looked == two
 
@@ -207,22 +210,6 @@ def test_the_forecast_moves_on_straight_lines(seed: int) -> None:
         assert np.median(moved) == pytest.approx(0.0, abs=0.1 * std_rad)
         spread = 0.5 * np.diff(np.quantile(moved, [0.159, 0.841]))[0]
         assert std_rad == pytest.approx(spread, rel=0.1)
-
-
-@given(SEEDS)
-@settings(max_examples=2)
-def test_classes_sum_to_one_and_the_hidden_have_a_sector(seed: int) -> None:
-    for world in run(WorldFilter(), script(seed, 30, sequence=True)):
-        for one in world.state.entities:
-            assert math.fsum(kind.probability for kind in one.classification) == pytest.approx(1.0, abs=1e-6)
-            hidden = one.status == "hidden"
-            assert (one.sector_rad is not None) == hidden
-            # A vehicle that was visible before may keep a forecast from its boxes.
-            assert (one.forecast is None) == hidden or one.last_seen_ns is not None
-        for cue in world.state.cues:
-            right, left = cue.sector_rad
-            assert right < cue.azimuth_rad < left
-            assert left - right == pytest.approx(2.0 * 1.6448536 * cue.azimuth_std_rad, abs=2e-6)
 
 
 @pytest.mark.parametrize(("twice", "entities"), [(range(2, 8), 1), (range(1, 40), 2)])
