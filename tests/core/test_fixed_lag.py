@@ -22,11 +22,12 @@ from street_measurements import (
 
 from worldstate import Measurement, WorldFilter
 from worldstate.abduction.co_evidence import Absent
+from worldstate.measurement import Odometry
 from worldstate.state import Delivery, WorldState
 
 
 def script(rng: np.random.Generator, hops: int = 18) -> list[Timed]:
-    """Return sound with a camera every 0.1 s, and sometimes a radio and a radar."""
+    """Return sound with a camera every 0.1 s, and sometimes a radio, a radar and odometry."""
     measured: list[Timed] = []
     for number in range(1, hops + 1):
         seen = [car(float(rng.uniform(-0.5, 0.5)))] * (rng.random() < 0.3)
@@ -38,6 +39,9 @@ def script(rng: np.random.Generator, hops: int = 18) -> list[Timed]:
             measured.append(replace(own, stamp_ns=stamp_ns, co_evidence=UNASKED, sightings=(), source="v2x"))
         if rng.random() < 0.2:
             measured.append(ordinary_scan(rng, number + rng.random(), rng.random() < 0.5))
+        if rng.random() < 0.2:
+            twist = float(rng.uniform(0.0, 2.0)), float(rng.normal(0.0, 0.1))
+            measured.append(Odometry("wheels", own.stamp_ns + int(rng.integers(0, 10**8)), *twist))
     return sorted(measured, key=lambda one: (one.stamp_ns, one.source))
 
 
