@@ -305,28 +305,6 @@ def test_evidence_is_ignored_for_1_5_s_after_a_hand_over(kind: str, seed: int) -
     assert moved == [False, False, True]
 
 
-def test_an_unseen_emerged_vehicle_lasts_as_long_as_its_sound() -> None:
-    """A dead or poor camera ends no entity; a good camera without a detection does."""
-    said = approach(in_view=0.8)
-
-    def beside(answer: CoEvidence) -> list[WorldFilter]:
-        return run(WorldFilter(settings=EXACT), all_heard(said, [UNASKED] * 30 + [answer] * 20))
-
-    dead, empty = beside(UNASKED), beside(ABSENT)
-    (before,) = dead[28].state.entities
-    assert before.status == "hidden" and before.existence_probability > 0.9
-    for world in (*dead[30:], *beside(Absent(0.9, 0.01))[30:]):
-        (now,) = world.state.entities
-        assert now.id == before.id and now.existence_probability >= 0.5
-    assert now.status == "emerged" and now.hidden_probability < 0.1
-    assert not [one for one in empty[35].state.entities if one.existence_probability > 0.2]
-    # The belief about coming vehicles is unchanged.
-    comes = said[-1].groups[:, :COMING]
-    np.testing.assert_allclose(belief(dead[-1])[:, :COMING], comes, rtol=1e-6, atol=1e-9)
-    again = WorldFilter.from_dict(dead[40].to_dict())
-    assert again.update(heard(42, said[41])).state == dead[41].state
-
-
 @settings(max_examples=20)
 @given(SEEDS, st.floats(0.001, 0.1), st.floats(0.0, 2000.0), st.integers(0, 50))
 def test_arrival_rates_are_a_gamma_posterior_with_a_limit(

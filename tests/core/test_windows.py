@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import null_space
-from street_measurements import UNASKED, after, hop
+from street_measurements import after, hop
 
 from worldstate import Context, FilterSettings, WorldFilter
-from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.belief.street_model import StreetModel
 from worldstate.measurement import Heard
 from worldstate.state import Priors, Rates, blind_corner
@@ -20,11 +19,6 @@ CORNERS = (blind_corner("left", 1), blind_corner("right", -1), replace(blind_cor
 AT_ONCE = FilterSettings(street=StreetModel(works=1.0, fails_s=1e6, window_s=1e-3))
 pauses_ns = st.integers(5 * 10**7, 2 * 10**9)
 chances = st.tuples(*[st.floats(0.05, 1.0)] * 3).map(lambda one: tuple(np.array(one) / sum(one)))
-answers = st.one_of(
-    st.builds(Absent, st.floats(0.0, 1.0), st.floats(0.0, 0.5)),
-    st.builds(Present, st.floats(0.0, 1.0), st.floats(0.001, 0.5)),
-    st.just(UNASKED),
-)
 PRIORS = Priors(0.3, 0.3, 0.4)
 # The steps are so short that the dynamics change nothing and only the evidence acts.
 MEMORY_NS = 10_000
@@ -65,21 +59,6 @@ def test_a_window_gives_eq_6_after_any_past(
         assert world.belief.hypotheses == pytest.approx(tuple(eq_6(priors, values)), abs=1e-6)
         if k == 1:
             assert world.belief.hidden[0] == pytest.approx(world.belief.hypotheses[0])
-
-
-@given(signatures)
-@settings(max_examples=20, deadline=None)
-def test_a_blind_camera_changes_nothing_and_a_perfect_one_excludes_visible(
-    values: tuple[float, float, float, float],
-) -> None:
-    """Law 2 for miss rates of one and zero."""
-    unasked, blind, perfect = (
-        street(2).update(hop(10, values, answer=answer)).belief
-        for answer in (UNASKED, Absent(1.0), Absent(0.0))
-    )
-    assert blind.hypotheses == pytest.approx(unasked.hypotheses, abs=1e-9)
-    assert blind.hidden == pytest.approx(unasked.hidden, abs=1e-9)
-    assert perfect.hypotheses[1] < 1e-6
 
 
 @given(st.tuples(*[st.floats(0.01, 3.0)] * 6), st.sampled_from([1, 2, 3]))
