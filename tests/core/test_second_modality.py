@@ -1,15 +1,15 @@
-"""V2X beacons use the same abduction and the same filter as sound: tests of the example."""
+"""Examples: V2X beacons use the same abduction and the same filter as sound; detections of Stone Soup."""
 
 import ast
 import importlib.util
+import runpy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from street_measurements import hop
 
-from worldstate import Absent, Unqueried, WorldFilter, nanoseconds
+from worldstate import Absent, Unqueried, nanoseconds
 from worldstate.belief.street_model import StreetModel
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "v2x_beacon.py"
@@ -78,26 +78,6 @@ def test_the_camera_query_follows_the_claimed_class(v2x):
     assert [type(answer) for answer in answers] == [Absent, Absent, Unqueried, Unqueried]
 
 
-def test_beacons_and_sound_share_one_filter(v2x):
-    """Sound and beacons together raise the belief above each of them and form one entity."""
-    doubtful = v2x.RadioSignature(loss_std_db=12.0)
-    beacons = v2x.approach_from_left(2.0)
-    radio = v2x.BeaconAdapter(doubtful).measure(beacons)
-    sound = [hop(m.stamp_ns / 1e8, (0.5, -0.5, 0.0, 0.3)) for m in radio]
-
-    def heard(measurements):
-        world = WorldFilter(settings=v2x.SETTINGS)
-        for m in sorted(measurements, key=lambda m: (m.stamp_ns, m.source)):
-            world = world.predict_to(m.stamp_ns).update(m)
-        return world
-
-    both = heard([*radio, *sound])
-    assert both.belief.hidden[0] > max(heard(w).belief.hidden[0] for w in (radio, sound))
-    (entity,) = both.state.entities
-    assert set(entity.sources) <= {"acoustic", "v2x"}
-    assert set(both.memory.sources) == {"acoustic", "v2x"}
-
-
 @pytest.mark.parametrize("example", ["v2x_beacon.py", "own_loop.py"])
 def test_the_examples_import_from_public_packages(example):
     tree = ast.parse((EXAMPLE.parent / example).read_text(encoding="utf-8"))
@@ -111,3 +91,10 @@ def test_the_beacon_example_runs_as_a_program(v2x, capsys):
     out = capsys.readouterr().out
     assert "hidden" in out
     assert "visible" in out
+
+
+def test_the_example_of_stone_soup_prints_the_output_on_the_page(capsys):
+    pytest.importorskip("stonesoup", reason="an example: pip install 'worldstate[oracles]'")
+    runpy.run_path(str(EXAMPLE.with_name("stone_soup.py")), run_name="__main__")
+    page = (EXAMPLE.parents[1] / "guide" / "from_stone_soup_and_odas.md").read_text(encoding="utf-8")
+    assert f"```text\n{capsys.readouterr().out}```" in page
