@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from street_measurements import hop, reading
+from street_measurements import EVEN, hop, reading
 
 from worldstate import WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent
@@ -15,7 +15,6 @@ from worldstate.state.sensor import Ego
 
 # In the map its front points to the left of the x axis.
 EGO = Ego((100.0, 50.0), 0.5 * np.pi, ((0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, 0.0, 1e-4)), 0.0, 0.0, True)
-SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
 def scripted_states(hops: int = 5) -> list[WorldState]:
@@ -25,7 +24,7 @@ def scripted_states(hops: int = 5) -> list[WorldState]:
     bins = {name: 0.0 for name in GROUPS if name.startswith("coming")}
     rest = {name: 0.08 * (1.0 - coming) for name in GROUPS if name not in bins}
     weights = bins | rest | {"coming_2s": coming, "seen": 0.6 * (1.0 - coming)}
-    said = replace(reading(weights, 1.0, share=SHARE), margin_s=0.2)
+    said = replace(reading(weights, 1.0, share=EVEN), margin_s=0.2)
     for number in range(1, hops + 1):
         look = Look("camera", number * 10**8, Absent(0.1, 0.01))
         world = world.update(hop(number, answer=look.answer, look=look, sequence=said))

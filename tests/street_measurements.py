@@ -29,6 +29,7 @@ ABSENT, PRESENT = Absent(0.04, 0.01), Present(0.04, 0.01)
 COMING = len(COMING_S)
 # One share for all tests, because a chain is computed once per share.
 SHARE = 0.9 * np.random.default_rng(0).dirichlet(np.ones(len(GROUPS))) + 0.1 / len(GROUPS)
+EVEN = np.full(len(GROUPS), 1.0 / len(GROUPS))
 CORNERS = Context(occluders=(corner_at("left", (8.0, 4.0), 12.0), corner_at("right", (8.0, -4.0), 12.0)))
 
 

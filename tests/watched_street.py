@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from street_measurements import car, hop, reading
+from street_measurements import EVEN, car, hop, reading
 
 from worldstate import Measurement
 from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
@@ -12,7 +12,6 @@ from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.measurement import Look
 
 SIDES, HOP_NS, START_NS = ("left", "right"), 10**8, 3600 * 10**9
-SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 ALARM = SequenceAlarm(0.0, 4.0)  # Four onsets per hour
 
 
@@ -24,7 +23,7 @@ def heard(number: int, loud: str | None, answer: CoEvidence, level: float = 20.0
         side = SIDES.index(loud)
         weights[side, GROUPS.index("coming_2s")] += level
         weights[1 - side, GROUPS.index("other")] += level
-    said = replace(reading(weights, share=SHARE), alarm=ALARM)
+    said = replace(reading(weights, share=EVEN), alarm=ALARM)
     at, nats = START_NS // HOP_NS + number, (-1.0, -1.0, -1.0, 1.0)
     look = Look("camera", at * HOP_NS, answer)
     return hop(at, nats, answer=answer, look=look, sequence=said)

@@ -51,14 +51,6 @@ def measured(number, hidden=(4.0, 0.0), **changes):
     return replace(hop(number, (*hidden, 2.0, 0.0), CAR, **whole), **changes)
 
 
-def street(rng, seconds):
-    """Return noise with a source on the left, whose peak makes the adapter query the camera."""
-    noise = rng.standard_normal((seconds * RATE_HZ, 56), dtype=np.float32)
-    return (0.02 * noise + 0.2 * rng.standard_normal((seconds * RATE_HZ, 1), dtype=np.float32)).astype(
-        np.float32
-    )
-
-
 def test_a_hop_of_the_chain_makes_at_most_40_checks():
     boxes = DetectionFrame(np.array([[900.0, 500.0, 1100.0, 650.0]]), np.array([0.9]), ("car",))
     vision = VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate([boxes] * 60, frame_rate_hz=10.0))
@@ -71,7 +63,10 @@ def test_a_hop_of_the_chain_makes_at_most_40_checks():
         code = frame.f_code
         calls += event == "call" and code.co_filename == checks.__file__ and code.co_name != "<genexpr>"
 
-    sound = street(np.random.default_rng(0), 3)
+    # Noise with a source ahead, whose peak makes the adapter query the camera.
+    rng = np.random.default_rng(0)
+    noise, source = (rng.standard_normal((3 * RATE_HZ, many), dtype=np.float32) for many in (56, 1))
+    sound = np.float32(0.02) * noise + np.float32(0.2) * source
     for measurement in adapter.measure(sound[: 2 * RATE_HZ]):
         world = world.predict_to(measurement.stamp_ns).update(measurement)
     sys.setprofile(count)
