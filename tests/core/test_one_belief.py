@@ -1,6 +1,5 @@
 """All values of a snapshot are marginals of one belief: laws over random inputs."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -193,17 +192,6 @@ def test_entities_split_and_merge_with_the_joint_belief(first: SequenceReading) 
     assert merged.into == one[0].id
 
 
-def test_the_remaining_of_two_entities_keeps_its_id() -> None:
-    """Almost no evidence is left on one side, so its entity dies or is merged."""
-    states = heard_as(TWO, both_sides((0.9, 0.02), (0.02, 0.9), "coming_2s"))
-    before = {one.direction: one.id for one in states[5].entities}
-    assert set(before) == {"left", "right"}
-    (last,) = states[-1].entities
-    assert (last.direction, last.id, last.sides) == ("left", before["left"], ())
-    (ended,) = (event for state in states[6:] for event in state.events)
-    assert ended.kind in ("died", "merged") and ended.entity_id == before["right"]
-
-
 @pytest.mark.parametrize("edge_rad", [0.53, -0.53])
 def test_an_entity_of_unknown_side_is_handed_over_at_either_edge(edge_rad: float) -> None:
     near = both_sides((0.55, 0.42), (0.42, 0.55), "coming_0.5s")
@@ -350,15 +338,3 @@ def test_a_silent_source_is_reported() -> None:
     assert [(one.condition, one.stamp_ns) for one in silent.sensors if one.sensor == "acoustic"] == [
         ("silent", 400_000_000)
     ]
-
-
-@given(SEEDS)
-@settings(max_examples=5, deadline=None)
-def test_without_windows_the_hypotheses_stay_at_equilibrium(seed: int) -> None:
-    """Without windows the equilibrium stays, whatever the steps."""
-    rng, world = np.random.default_rng(seed), WorldFilter(Context())
-    start = world.belief.hypotheses
-    for step_s in rng.uniform(0.0, 2.0, 10).tolist():
-        world = world.predict(step_s)
-        assert world.belief.hypotheses == pytest.approx(start, abs=2e-2)
-        assert math.isclose(sum(world.belief.hypotheses), 1.0, abs_tol=1e-9)

@@ -1,7 +1,6 @@
 """Examples: V2X beacons use the same abduction and the same filter as sound; detections of Stone Soup."""
 
 import ast
-import importlib.util
 import runpy
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +16,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "v2x_beaco
 
 @pytest.fixture(scope="module")
 def v2x():
-    spec = importlib.util.spec_from_file_location("v2x_beacon", EXAMPLE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(EXAMPLE)))
 
 
 def last(states):

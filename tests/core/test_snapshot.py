@@ -248,10 +248,8 @@ def full_state():
     cue = RiskCue("left", 0.9, 0.3, 0.7, 0.9, 0.95, 2.0, Priors(0.7, 0.2, 0.1), advisory, 0.02, "a", 2.5)
     cue = replace(cue, evidence=EvidenceTerms("hidden", {"prior": 0.1}, 0.1, 2.0))
     edge = Relation("a", "corner_left", "occluded_by", 0.9, 2)
-    context, view = (
-        Context(priors=Priors(0.2, 0.3, 0.5)),
-        SearchedView("camera", 2, False, 0.1, 0.01, (-1, 1)),
-    )
+    context = Context(priors=Priors(0.2, 0.3, 0.5))
+    view = SearchedView("camera", 2, False, 0.1, 0.01, (-1, 1))
     told = {"sensors": (sensor,), "searched": (view,), "events": (Event(2, "born", "a"),)}
     return WorldState(2, 1, (entity,), (edge,), context, (cue,), **told)
 
