@@ -37,8 +37,9 @@ def _chances(state: WorldState) -> Iterator[str]:
     for one in state.entities:
         if not 0.0 <= (one.hidden_probability or 0.0) <= one.existence_probability:
             yield f"P(hidden) {one.hidden_probability} of an existence of {one.existence_probability}"
-        if abs(one.azimuth_rad) > math.pi or one.azimuth_std_rad <= 0.0:
-            yield f"an azimuth of {one.azimuth_rad} +- {one.azimuth_std_rad}"
+        azimuths_rad = one.azimuth_rad, *(later_rad for later_rad, _ in (one.forecast or {}).values())
+        if max(map(abs, azimuths_rad)) > math.pi or one.azimuth_std_rad <= 0.0:
+            yield f"azimuths of {azimuths_rad} +- {one.azimuth_std_rad}"
         if abs(math.fsum(kind.probability for kind in one.classification) - 1.0) > 1e-6:
             yield f"classes that do not sum to one: {one.classification}"
         hidden = one.status == "hidden"
@@ -52,6 +53,8 @@ def _chances(state: WorldState) -> Iterator[str]:
     names = {one.id for one in (*state.entities, *state.context.occluders)} | {"ego"}
     if any(not {one.src, one.dst} <= names for one in state.relations):
         yield "a relation of what the snapshot does not hold"
+    if any(abs(end_rad) > math.pi for view in state.searched for end_rad in view.sector_rad or ()):
+        yield f"sectors beyond half a turn: {state.searched}"
     for cue in state.cues:
         hidden, visible, none = cue.hypotheses.hidden, cue.hypotheses.visible, cue.hypotheses.none
         if abs(hidden + visible + none - 1.0) > SLACK:

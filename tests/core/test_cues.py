@@ -155,19 +155,6 @@ def test_a_scan_is_a_look_at_its_own_sector_and_a_message_at_none() -> None:
     assert [event.kind for event in world.state.events] == ["born"]
 
 
-def test_azimuths_behind_the_vehicle_are_wrapped() -> None:
-    spread = ((0.1, 0.0), (0.0, 0.1))
-    for centre_rad, half_rad, y_m in ((math.pi, 0.5, 0.0), (math.pi, 0.5, 1e-9), (0.7, math.pi, -1e-9)):
-        searched = SearchedSector(Sector(centre_rad, half_rad), 70.0, 0.9)
-        state = after(PositionScan("radar", 10**9, (Position((-10.0, y_m), spread),), searched)).state
-        (one,), (view,) = state.entities, state.searched
-        azimuths = one.azimuth_rad, *(at for at, _ in (one.forecast or {}).values()), *view.sector_rad
-        assert all(-math.pi <= azimuth <= math.pi for azimuth in azimuths)
-        ends = Sector.between(*view.sector_rad)
-        assert ends.half_width_rad == pytest.approx(half_rad)
-        assert half_rad == math.pi or abs(ends.centre_rad) == pytest.approx(math.pi)
-
-
 def test_a_high_risk_without_sound_has_its_reason() -> None:
     slow = Context(rates=Rates(emergence_hz=0.02, departure_hz=0.02))
     world = after(*(hop(number, (8.0, 0.0, 0.0, 0.0)) for number in range(1, 20)), world=WorldFilter(slow))

@@ -132,12 +132,6 @@ def looks(said: SequenceReading, hops: int, *azimuths_rad: float) -> Iterator[Me
         yield hop(number, QUIET, *boxes, answer=answer, sequence=said)
 
 
-def seen_from_left(said: SequenceReading) -> tuple[WorldState, WorldState]:
-    """Return the states before and after a vehicle came into view past the left edge."""
-    *_, before, last = run(WorldFilter(), looks(said, 10, 0.53))
-    return before.state, last.state
-
-
 def cue_of(state: WorldState, side: str):
     return next(cue for cue in state.cues if cue.direction == side)
 
@@ -219,7 +213,8 @@ def test_a_masked_second_vehicle_keeps_its_existence() -> None:
 
 
 def test_the_advisory_ends_with_the_hand_over() -> None:
-    before, after = seen_from_left(both_sides((0.97, 0.01), (0.01, 0.97), "coming_0.5s"))
+    near = both_sides((0.97, 0.01), (0.01, 0.97), "coming_0.5s")
+    before, after = (world.state for world in run(WorldFilter(), looks(near, 10, 0.53))[-2:])
     assert [event.kind for event in after.events] == ["handed_over"]
     assert cue_of(before, "left").advisory is not None and cue_of(after, "left").advisory is None
     # The risk is the share of vehicles that are followed by another.

@@ -290,8 +290,6 @@ def test_damage_is_accepted_or_refused_by_a_typed_error(data):
         (("entities", 0, "azimuth_rad"), "left", r"snapshot\.entities\[0\]\.azimuth_rad: expected a finite"),
         (("entities", 0, "existence_probability"), 1.2, "existence_probability: expected a number in"),
         (("entities", 0, "status"), "ghost", "status: expected one of hidden, emerged, visible"),
-        (("relations",), {}, "relations: expected a list"),
-        (("cues", 0, "advisory"), True, "advisory: expected an object"),
         (("cues", 0, "advisory", "since_ns"), 0.5, "advisory.since_ns: expected a whole number"),
         (("sensors", 0, "condition"), None, r"sensors\[0\].condition: expected text"),
         (("context", "rates", "arrival_hz"), -1.0, "arrival_hz: expected a number in"),
