@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from hop_tables import blank_stream
 from scipy.ndimage import gaussian_filter
 from street_frames import street
+from test_hazard_awareness import staged
 from worldstate_lab.degradation.beta_curves import absence_counts, counts_table
 from worldstate_lab.degradation.conditions import (
     CLEAN,
@@ -20,7 +20,6 @@ from worldstate_lab.degradation.conditions import (
     RAIN_DB,
     READINGS,
     Condition,
-    all_conditions,
     degradation_in,
     degrade_reduced,
     detections_in,
@@ -268,17 +267,11 @@ def readings():
 
 
 def believed(number, approach):
-    """Return beliefs from correct sound, and from a camera that is correct until it is degraded."""
-    rng, blank = np.random.default_rng(number), blank_stream(f"r{number}", 40)
-    there = approach & (blank.time_s > 3.0)
-    tables = []
-    for state in all_conditions():
-        found = there & (state.camera.level < 3) & (state.name != OFF)
-        columns = {"there": there, "found": found, "seen": found, "answer": np.full(40, 1)}
-        columns |= {"log_likelihoods": rng.normal(0.0, 1.0, (40, 4)), "presence": 0.5 + 0.4 * there}
-        columns |= {"miss_rate": np.full(40, 0.5), "clutter_rate": np.full(40, 0.01)}
-        tables.append(blank.replace(degradation=np.zeros(40), condition=np.full(40, state.name), **columns))
-    return joined(tables).replace(label="left" if approach else "none", t0_s=3.0 if approach else np.nan)
+    """Return the beliefs of `staged` in every condition, as the pass over a recording returns them."""
+    tables = staged(number, approach, np.random.default_rng(number))
+    clean = tables[CLEAN]
+    every = joined(one.replace(condition=np.full(len(one), name)) for name, one in tables.items())
+    return every.replace(label=clean.label, t0_s=clean.t0_s)
 
 
 def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):

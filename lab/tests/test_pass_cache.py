@@ -37,16 +37,13 @@ def tables(draw):
 
 def assert_same(first, second):
     assert list(first) == list(second)
-    for name in first:
-        one, other = first[name], second[name]
+    for one, other in zip(first.values(), second.values(), strict=True):
+        # In text NaN equals NaN, which `==` does not give.
+        fields = (repr((some.name, some.label, some.t0_s, some.about)) for some in (one, other))
+        assert len({*fields}) == 1
         assert list(one.columns) == list(other.columns)
-        for column in one.columns:
-            assert one.columns[column].dtype == other.columns[column].dtype
-            np.testing.assert_array_equal(one.columns[column], other.columns[column])
-        # In JSON text NaN equals NaN, which `==` does not give.
-        assert repr((one.name, one.label, one.t0_s, one.about)) == repr(
-            (other.name, other.label, other.t0_s, other.about)
-        )
+        for mine, theirs in zip(one.columns.values(), other.columns.values(), strict=True):
+            np.testing.assert_array_equal(mine, theirs, strict=True)
 
 
 @settings(max_examples=40, deadline=None)

@@ -275,13 +275,6 @@ def test_the_command_simulates_the_junctions_of_a_table(group, sites, tmp_path, 
     assert set(report["profiles"]["seed 4"]) == set(sites)
     pair = [read_features(tmp_path / "r" / f"{name}-4.csv") for name in ("windows", "permuted")]
     assert pair[0].labels.tolist() == pair[1].labels.tolist()
-    given = [*words, "--simulated", str(tmp_path / "r" / "windows-4.csv"), "--measures-only"]
-    assert main(given) == 0
-    first, again = (
-        {(one["figure"], one["windows"]): one["simulated"] for one in found["rows"]}
-        for found in (report, json.loads(capsys.readouterr().out))
-    )
-    assert again["sd of log level", "none"] == {"windows-4": first["sd of log level", "none"]["seed 4"]}
 
 
 def test_a_table_without_the_group_is_rejected_before_the_work(tmp_path, capsys):

@@ -180,6 +180,7 @@ def test_the_command_scores_a_made_up_corner(tmp_path, capsys) -> None:
     found = report["seven"]
     assert found["recordings"] == 4
     assert found["failed"] == {}
+    assert {"horizons", "risk"} <= set(found)
     assert {"world-state advisory", "Vision-only", "OC-SORT recovery (coasting)"} <= set(found["rows"])
     assert found["rows"]["Vision-only"]["warned"] == 0.0
     assert list(found["leads"]) == ["0.5", "1", "1.5", "2", "3", "5", "6"]
