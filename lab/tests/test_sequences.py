@@ -30,12 +30,11 @@ def corner(approaches=4, calm=4, *, t0_s=5.0, hops=81, start_s=0.0):
     """Return approaches alternately from right and left at two junctions, and recordings without a
     vehicle."""
     labels = [("right", "left")[i % 2] for i in range(approaches)] + ["none"] * calm
-    trials = [
-        made_up(f"r{i}", label, t0_s=t0_s - start_s, hops=hops - round(10 * start_s), site=f"S{i // 2 % 2}")
+    left_s, hops = t0_s - start_s, hops - round(10 * start_s)
+    return [
+        made_up(f"r{i}", label, t0_s=left_s, hops=hops, site=f"S{i // 2 % 2}", leads_from_s=left_s)
         for i, label in enumerate(labels)
     ]
-    since = {"leads_from_s": t0_s - start_s}
-    return [replace(one, hops=one.hops.replace(about={**one.hops.about, **since})) for one in trials]
 
 
 def before(trial, first_s, last_s=0.0):

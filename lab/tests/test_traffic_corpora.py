@@ -29,10 +29,8 @@ PASSAGE = "2024-02-09_13-62-1.8-Fitzroy1_FF_1V-{}_L1_2Lanes_LR_stereo"
 def write_sound(path, seconds=CLIP_S, rate_hz=8000):
     """Write noise that is louder if a vehicle passes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    rng, most = (
-        np.random.default_rng(crc32(path.name.encode())),
-        0.1 if "BG" in path.parent.name + path.name else 0.3,
-    )
+    rng = np.random.default_rng(crc32(path.name.encode()))
+    most = 0.1 if "BG" in path.parent.name + path.name else 0.3
     soundfile.write(path, rng.uniform(-most, most, (round(seconds * rate_hz), 2)), rate_hz)
 
 
