@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from street_frames import street
-from test_hazard_awareness import staged
+from test_hazard_awareness import recording, staged
 from worldstate_lab.degradation.beta_curves import absence_counts, counts_table
 from worldstate_lab.degradation.conditions import (
     CLEAN,
@@ -43,7 +43,7 @@ from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
-from worldstate.adapters.datasets.ovad import DETECTION_NAMES, OvadDataset, Recording
+from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import open_source
 from worldstate.cli.main import main
@@ -276,17 +276,12 @@ def believed(number, approach):
 
 def test_miss_rates_of_a_recording_come_from_the_others(tmp_path):
     """Each recording has a power of two as number of looks, so that the sum shows which ones it contains."""
-    recordings = []
-    for i in range(8):
-        folder = tmp_path / f"r{i}"
-        folder.mkdir()
-        for name in (VIDEO_NAME, DETECTION_NAMES[0]):
-            (folder / name).touch()
-        recordings.append(Recording(folder, f"r{i}", f"SA{i % 2}", "left" if i < 4 else "none", 30))
+    sides = ("left",) * 4 + ("none",) * 4
+    recordings = [recording(tmp_path, f"SA{i % 2}", side, i) for i, side in enumerate(sides)]
     used = {}
 
     def kept(name, key, make):
-        number = int((key if name == "degraded-looks" else key[1])[1][1:])
+        number = int((key if name == "degraded-looks" else key[1])[1][-1])
         if name == "degraded-looks":
             looks = ((2.0**number,) * 5,) * 4
             misses = ((0.0, 0.0, 0.0, 2.0**number, 2.0**number),) * 4
