@@ -137,10 +137,7 @@ def test_exam_figures_are_written_and_absent_from_files_of_version_1_8(tmp_path,
 def test_written_and_read_back_to_the_bit(made, tmp_path):
     save_model(tmp_path / "m", made())
     assert [p.name for p in tmp_path.iterdir()] == ["m"]
-    again = read_model(tmp_path / "m")
-    assert encode(again) == encode(made())
-    X = np.random.default_rng(0).random((5, 60))
-    np.testing.assert_array_equal(again.signature.predict_proba(X), made().signature.predict_proba(X))
+    assert encode(read_model(tmp_path / "m")) == encode(made())
 
 
 def test_a_packed_file_equals_the_plain_one_and_is_reproducible(tmp_path):

@@ -22,7 +22,7 @@ from simulated_sound import (
 )
 from worldstate_lab.streets.simulated_windows import RATE_HZ, simulated_window_pair
 
-from worldstate.frontend.array.microphone_array import ovad_array
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
 from worldstate.simulation import SimulationSettings, simulate_recording
 from worldstate.simulation.scene.driving import entry_y_m
@@ -35,7 +35,6 @@ from worldstate.simulation.sound.delay import (
     OVERSAMPLING,
     SampledSignal,
     add_delayed,
-    emission_times,
 )
 from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, edge_gain, screen_attenuation_db
 from worldstate.simulation.sound.paths import trace_paths
@@ -71,19 +70,9 @@ def test_fractional_delay_error_is_below_minus_50_db(frequency):
     assert error_db(out, np.sin(2 * np.pi * frequency * (np.arange(len(out)) / FS - delay))) < -50.0
 
 
-@given(st.floats(-30.0, 30.0), st.floats(5.0, 40.0), st.floats(-20.0, 20.0))
-def test_emission_times_solve_the_retarded_time_equation(speed, lane, y0):
-    emit = np.linspace(-1.0, 2.0, 1200)
-    travel = np.hypot(lane, y0 + speed * emit)
-    receive = np.linspace(0.0, 1.5, 50)
-    found = emission_times(receive, emit, travel)
-    # Linear between knots: v^2 h^2 / (8 r c) is 0.6 us at the worst, 0.06 % of a period at 1 kHz.
-    np.testing.assert_allclose(found + np.hypot(lane, y0 + speed * found) / C, receive, rtol=0.0, atol=6e-7)
-
-
 def test_free_field_waveform_equals_acoular():
     """Distance, delay and Doppler shift of a vehicle at three microphones."""
-    from acoular_scene import Samples, acoular
+    from acoular_scene import Samples, render
 
     speed, lane, y0, seconds = 13.0, 6.0, -9.0, 1.2
     n = int(seconds * FS)
@@ -95,17 +84,12 @@ def test_free_field_waveform_equals_acoular():
         street, lambda time: signal[: len(time)], lambda time: (lane, y0 + speed * time), head_s=0.0
     )
     ours = carried(street, sent)
-    times_s = np.linspace(-0.2, seconds + 0.2, 60)
-    points = {time_s: (lane, y0 + speed * time_s, SOURCE_HEIGHT_M) for time_s in times_s.tolist()}
-    source = acoular.MovingPointSource(
+    theirs = render(
+        MicrophoneArray(positions),
+        lambda time_s: np.array([lane, y0 + speed * time_s, SOURCE_HEIGHT_M]),
+        seconds,
         signal=Samples(sample_freq=FS, num_samples=n, samples=signal),
-        mics=acoular.MicGeom(pos_total=positions.T),
-        env=acoular.Environment(c=C),
-        trajectory=acoular.Trajectory(points=points),
-        start=0.0,
-        up=16,
     )
-    theirs = np.concatenate(list(source.result(4096)))
     inner = slice(4800, min(len(theirs), ours.shape[1]) - 2000)
     for ours_one, theirs_one in zip(ours, theirs.T, strict=True):
         assert np.corrcoef(ours_one[inner], theirs_one[inner])[0, 1] > 0.999

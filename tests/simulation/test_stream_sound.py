@@ -238,9 +238,7 @@ def test_a_stream_on_disk_reads_as_a_recording(tmp_path: Path, capsys: pytest.Ca
         assert all((row["time_to_visible_s"] == "") == (event["t0_s"] is None) for row in own)
 
 
-def test_the_stream_command_offers_all_traffic_and_reports_bad_options(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_stream_command_offers_all_traffic_and_reports_bad_options(tmp_path, capsys):
     refused = {
         "--minutes 1 --site DA1": "drives are heard",
         "--minutes 1 --static 2": "--static",

@@ -125,9 +125,7 @@ def test_traffic_without_hazards_leaves_other_flows_unchanged() -> None:
     kind=st.sampled_from(["light", "heavy", "bicycle"]),
     start_s=st.floats(-5.0, 50.0),
 )
-def test_time_to_visible_at_constant_speed_is_distance_over_speed(
-    arm: str, where: str, speed: float, kind: str, start_s: float
-) -> None:
+def test_time_to_visible_at_constant_speed_is_distance_over_speed(arm, where, speed, kind, start_s):
     plan = site(where)
     driver = Driver(plan, vehicle_kind(kind), arm, speed, 0.0, 40.0)
     event = VehicleEvent(arm, emerges(driver, np.random.default_rng(0)), start_s)
@@ -146,9 +144,7 @@ def test_time_to_visible_at_constant_speed_is_distance_over_speed(
 
 
 @given(cruise=st.floats(2.0, 15.0), stop=st.floats(20.0, 60.0), stands_s=st.floats(0.5, 20.0))
-def test_a_stop_follows_uniform_deceleration_and_acceleration(
-    cruise: float, stop: float, stands_s: float
-) -> None:
+def test_a_stop_follows_uniform_deceleration_and_acceleration(cruise, stop, stands_s):
     route = along([[6.0, 0.0], [6.0, -1.0]])
     driver = Driver(site("SB1"), LIGHT, "left", cruise, 0.0, 90.0)
     motion = driver.motion(route, (0.0, 90.0), [SpeedLimit(stop, 0.0, stands_s)])
@@ -166,9 +162,7 @@ def test_a_stop_follows_uniform_deceleration_and_acceleration(
 
 
 @given(st.floats(0.5, 2.0), st.sampled_from(["SA1", "SB1", "TB7"]), st.integers(0, 999))
-def test_a_preset_scales_the_speed_of_vehicles_and_not_of_bicycles(
-    factor: float, where: str, seed: int
-) -> None:
+def test_a_preset_scales_the_speed_of_vehicles_and_not_of_bicycles(factor, where, seed):
     usual = preset()
     for kind in ("light", "bicycle"):
         one, fast = (
