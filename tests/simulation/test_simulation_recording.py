@@ -23,7 +23,7 @@ from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
+from worldstate.frontend.array.microphone_array import ovad_array
 from worldstate.frontend.direction.feature import feature_nfft, published_feature
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.ground.errors import InputFileError, OutOfDomainError
@@ -224,15 +224,11 @@ BEFORE = 94
 
 
 def vehicle_sound(
-    settings: SimulationSettings,
-    array: MicrophoneArray,
-    sources: list[SourceSignal],
-    samples: int,
-    rate: float,
+    settings: SimulationSettings, sources: list[SourceSignal], samples: int, rate: float
 ) -> np.ndarray:
-    """Return the sound of one vehicle with these signals at an array by every path, (M, n)."""
+    """Return the sound of one vehicle with these signals by every path, (M, n)."""
     seconds = -(-samples // KNOT_SAMPLES) * KNOT_SAMPLES / rate
-    street = street_of(settings.site, standing_m(array), seconds + 1e-6, rate, settings.ego, settings.preset)
+    street = street_of(settings.site, standing_m(ARRAY), seconds + 1e-6, rate, settings.ego, settings.preset)
 
     def placed(one: SourceSignal) -> PlacedSource:
         def way(time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -250,7 +246,7 @@ def decimated(sound: np.ndarray) -> np.ndarray:
     return resample_poly(sound, 1, FACTOR, axis=-1, window=("kaiser", 8.0)).astype(np.float32)
 
 
-def feature_errors(number: int, duration_s: float, array: MicrophoneArray = ARRAY) -> np.ndarray:
+def feature_errors(number: int, duration_s: float) -> np.ndarray:
     """Return the rms change of the feature at an eighth of the rate, relative to its rms, per second."""
     rng = np.random.default_rng([7, number])
     settings = draw_settings(SITES[number % len(SITES)], ("left", "right")[number % 2], rng, duration_s)
@@ -261,21 +257,21 @@ def feature_errors(number: int, duration_s: float, array: MicrophoneArray = ARRA
     whole = emit(path, samples, SAMPLE_RATE_HZ, settings.preset.vehicle_level_db, rng)
     less = [SourceSignal(decimated(one.signal), one.behind_m, one.height_m) for one in whole]
     # The ambience is drawn once at the full rate, because a lower rate would draw other noise.
-    ambience = np.zeros((array.n_microphones, round(duration_s * SAMPLE_RATE_HZ)), np.float32)
+    ambience = np.zeros((ARRAY.n_microphones, round(duration_s * SAMPLE_RATE_HZ)), np.float32)
     knots_s = np.arange(2) * KNOT_SAMPLES / SAMPLE_RATE_HZ
-    receiver = Receiver(standing_m(array), np.zeros(array.n_microphones), knots_s)
+    receiver = Receiver(standing_m(ARRAY), np.zeros(ARRAY.n_microphones), knots_s)
     add_ambience(ambience, receiver, settings.site, settings.preset, rng)
-    full = ambience + vehicle_sound(settings, array, whole, ambience.shape[1], SAMPLE_RATE_HZ)
+    full = ambience + vehicle_sound(settings, whole, ambience.shape[1], SAMPLE_RATE_HZ)
     low = decimated(ambience)
-    low += vehicle_sound(settings, array, less, low.shape[1], LOW_HZ)
-    expected, found = features(full, array, SAMPLE_RATE_HZ), features(low, array, LOW_HZ)
+    low += vehicle_sound(settings, less, low.shape[1], LOW_HZ)
+    expected, found = features(full, SAMPLE_RATE_HZ), features(low, LOW_HZ)
     return np.asarray(np.sqrt(((found - expected) ** 2).mean(axis=1) / (expected**2).mean(axis=1)))
 
 
-def features(sound: np.ndarray, array: MicrophoneArray, rate: float) -> np.ndarray:
+def features(sound: np.ndarray, rate: float) -> np.ndarray:
     starts = range(int(sound.shape[1] / rate + 1e-3))
     return np.array(
-        [published_feature(sound.T[round(s * rate) :][: round(rate)], array, rate) for s in starts]
+        [published_feature(sound.T[round(s * rate) :][: round(rate)], ARRAY, rate) for s in starts]
     )
 
 

@@ -238,9 +238,9 @@ def tones(time: np.ndarray) -> np.ndarray:
     return sum(np.cos(2 * np.pi * (50.0 * number * time + phase)) for number, phase in shifts)
 
 
-def heard(plan: Site, way, seconds: float, positions=ONE, height_m=HEIGHT_M, sound=band_noise) -> np.ndarray:
+def heard(plan: Site, way, seconds: float, height_m=HEIGHT_M, sound=band_noise) -> np.ndarray:
     """Return the sound of a source on the route `way(t)`; it begins 0.4 s earlier, 130 m away."""
-    street = street_of(plan, positions, seconds, COARSE_FS)
+    street = street_of(plan, ONE, seconds, COARSE_FS)
     return carried(street, source_in(street, sound, way, 0.4, height_m))
 
 
@@ -320,19 +320,8 @@ def test_a_driving_ego_passes_a_source_in_its_street():
     assert error_db(found, expected) < -30.0
 
 
-def level_steps_db(plan: Site, points, speed: float, seconds: float) -> np.ndarray:
-    """Return changes of level per tenth of a second along a route."""
-    way = along(points)
-    (found,) = heard(plan, lambda time: way.at(speed * time), seconds, sound=tones)
-    tenths = len(found) // int(0.1 * COARSE_FS)
-    power = (found[: tenths * int(0.1 * COARSE_FS)].reshape(tenths, -1) ** 2).mean(axis=1)
-    return np.diff(10 * np.log10(power))
-
-
-DRAWN_ONLY = (Phase.explicit, Phase.reuse, Phase.generate)  # each takes half a second: not shrunk
-
-
-@settings(max_examples=4, deadline=None, phases=DRAWN_ONLY)
+# Each takes half a second, so they are not shrunk.
+@settings(max_examples=4, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.floats(1.2, 1.8), st.floats(3.0, 4.5), st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
 def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, arm):
     """At 1.5 m/s steps are small until the steep edge of the corner's shadow."""
@@ -340,9 +329,12 @@ def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, ar
     # click.
     across, lane = side * beside, STREET.corner_ahead_m + beyond
     turn = (lane - 0.4, across + arm * 0.2), (lane, arm * 3.2)
-    points = ((-4.0, across), (3.0, across), *turn, (lane, arm * 9.0))
-    steps = np.abs(level_steps_db(STREET, points, 1.5, 10.0))
-    lit = np.abs(along(points).at(0.15 * (np.arange(len(steps)) + 2.0))[1]) < 3.3
+    way = along(((-4.0, across), (3.0, across), *turn, (lane, arm * 9.0)))
+    (found,) = heard(STREET, lambda time: way.at(1.5 * time), 10.0, sound=tones)
+    tenth = int(0.1 * COARSE_FS)
+    power = (found[: len(found) // tenth * tenth].reshape(-1, tenth) ** 2).mean(axis=1)
+    steps = np.abs(np.diff(10 * np.log10(power)))
+    lit = np.abs(way.at(0.15 * (np.arange(len(steps)) + 2.0))[1]) < 3.3
     assert steps[lit].max() < 1.8
     assert steps.max() < 2.5
 
