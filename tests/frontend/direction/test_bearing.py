@@ -1,4 +1,4 @@
-"""SRP-PHAT against pyroomacoustics, and the stated error of a bearing, which is large for noise."""
+"""SRP-PHAT and MUSIC against pyroomacoustics; the stated error of a bearing, which is large for noise."""
 
 import numpy as np
 import pyroomacoustics
@@ -9,6 +9,7 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_arr
 from worldstate.frontend.array.steering import Steering
 from worldstate.frontend.direction.bearing import AcousticBearing, BearingScatter, find_peaks, srp_phat
 from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.direction.music import count_sources, covariance, music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
 from worldstate.frontend.stream import AcousticFrame, FrontEnd
@@ -151,3 +152,56 @@ def test_the_error_covers_both_of_two_equal_sources(microphones: int) -> None:
     assert alone.bearing_std_rad < np.radians(12)
     assert both.bearing_std_rad > np.radians(35)
     assert alone.bearing_std_rad <= weak.bearing_std_rad < 0.6 * both.bearing_std_rad
+
+
+# The bins from 281 to 1688 Hz.
+BINS = np.arange(3, 19)
+FREQUENCIES = bin_frequencies_hz(range(3, 19), 48_000, 512)
+
+
+def plate(microphones: int, rng: np.random.Generator) -> MicrophoneArray:
+    """Return microphones anywhere on a vertical plate."""
+    return MicrophoneArray(np.column_stack([np.zeros(microphones), rng.uniform(-0.4, 0.4, (microphones, 2))]))
+
+
+def circular(rng, *shape):
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
+
+
+def spectra_of(array, azimuths, rng, frames):
+    """Plane waves in white noise of twice their power: spectra (frames, bins, M) complex64."""
+    waves = circular(rng, frames, len(BINS), len(azimuths)) * np.sqrt(0.5)
+    signal = np.einsum("fbd,bmd->fbm", waves, array.steering(FREQUENCIES, np.asarray(azimuths)))
+    return (signal + circular(rng, *signal.shape)).astype(np.complex64)
+
+
+@pytest.mark.parametrize(("frames", "sources"), [(18, 1), (18, 2), (187, 2)])
+def test_music_equals_pyroomacoustics(frames, sources):
+    """Also with fewer frames than microphones."""
+    rng = np.random.default_rng(frames + sources)
+    array = plate(56, rng)
+    X = spectra_of(array, [0.4, -0.3][:sources], rng, frames)
+    peer = pyroomacoustics.doa.MUSIC(
+        array.positions_m.T, 48_000, 512, c=343.0, num_src=sources, azimuth=AZIMUTHS
+    )
+    padded = np.zeros((56, 257, frames), dtype=complex)
+    padded[:, BINS] = X.transpose(2, 1, 0)
+    peer.locate_sources(padded, freq_bins=BINS)
+    ours = music_spectrum(
+        signal_subspace(X, sources), array.steering(FREQUENCIES, AZIMUTHS).astype(np.complex64)
+    )
+    np.testing.assert_allclose(ours, peer.grid.values, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("microphones", "frames", "truths", "azimuths_deg"),
+    [*((12, 100, [truth] * 40, (-50, 10, 45)) for truth in range(4)), (56, 19, [0, 1, 2] * 10, (-40, 30))],
+)
+def test_number_of_sources(microphones, frames, truths, azimuths_deg):
+    """Also with fewer frames than microphones."""
+    rng = np.random.default_rng(truths[-1])
+    array, hits = plate(microphones, rng), 0
+    for truth in truths:
+        X = spectra_of(array, np.deg2rad(azimuths_deg[:truth]), rng, frames)
+        hits += count_sources(np.linalg.eigvalsh(covariance(X)), frames) == truth
+    assert hits >= 0.9 * len(truths)
