@@ -62,6 +62,13 @@ def line(frequency_hz: float, seconds: float, rate: float, phase: float = 0.3) -
     return np.cos(2 * np.pi * frequency_hz / rate * np.arange(round(seconds * rate)) + phase)
 
 
+def read(sound: np.ndarray, rate: float, array: MicrophoneArray = PAIR, keep=(True, True)):
+    """Return the reading after a sound at the microphones."""
+    stage = ToneStage(array, rate)
+    stage.push(sound.astype(np.float32), ChannelMask(np.array(keep)))
+    return stage.read()
+
+
 def each_hop(sound: np.ndarray) -> list[ToneReading | NotUsable]:
     """Return readings per hop if both microphones receive the same sound."""
     stage, found = ToneStage(PAIR, SLOW), []
@@ -143,9 +150,7 @@ def test_a_weak_line_is_found_beside_rumble() -> None:
     f = np.fft.rfftfreq(n, 1 / RATE)
     rumble = np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) / np.maximum(f, 2.0) ** 1.5, n)
     rumble /= rumble.std()
-    stage = ToneStage(PAIR, RATE)
-    stage.push(on_both(rumble + 2.0 + 0.03 * line(151.7, 2.0, RATE)), BOTH)
-    reading = stage.read()
+    reading = read(on_both(rumble + 2.0 + 0.03 * line(151.7, 2.0, RATE)), RATE)
     assert abs(reading.frequency_hz - 151.7) < 4 * reading.frequency_std_hz < 0.2
 
 
@@ -167,25 +172,18 @@ def test_a_line_is_found_from_any_direction(azimuth_deg: float) -> None:
     array, f = roof_array_56(), 380.0
     delays = array.delays_s(np.radians(azimuth_deg)).ravel()
     t = np.arange(8_000)[:, None] / 8_000
-    stage = ToneStage(array, 8_000)
-    stage.push(np.cos(2 * np.pi * f * (t - delays)).astype(np.float32), ChannelMask.all_of(56))
-    reading = stage.read()
+    reading = read(np.cos(2 * np.pi * f * (t - delays)), 8_000, array, [True] * 56)
     assert reading.frequency_hz == pytest.approx(f, abs=1e-4)
 
 
 def test_masked_microphones_have_no_effect_on_the_tone() -> None:
     sound = on_both(line(90.0, 1.0, 8_000))
     sound[:, 1] = 1e3 * line(210.0, 1.0, 8_000)
-    stage = ToneStage(PAIR, 8_000)
-    stage.push(sound, ChannelMask(np.array([True, False])))
-    reading = stage.read()
-    assert reading.frequency_hz == pytest.approx(90.0, abs=1e-3)
+    assert read(sound, 8_000, keep=(True, False)).frequency_hz == pytest.approx(90.0, abs=1e-3)
 
 
 def test_an_unusable_tone_has_its_reason() -> None:
-    stage = ToneStage(PAIR, 8_000)
-    stage.push(on_both(line(90.0, 0.5, 8_000)), BOTH)
-    assert stage.read() == NotUsable("needs 0.99 s of sound")
+    assert read(on_both(line(90.0, 0.5, 8_000)), 8_000) == NotUsable("needs 0.99 s of sound")
     silent = FrontEnd(PAIR, 8_000, SETTINGS).process(np.zeros((8_000, 2)))[0]
     assert silent.tone == NotUsable("silence")
     assert isinstance(FrontEnd(PAIR, 8_000).process(np.zeros((8_000, 2)))[0].tone, NotUsable)
@@ -193,7 +191,5 @@ def test_an_unusable_tone_has_its_reason() -> None:
 
 @pytest.mark.parametrize("scale", [1e-9, 1e14])
 def test_level_does_not_matter(scale: float) -> None:
-    stage = ToneStage(PAIR, 8_000)
-    stage.push(on_both(scale * line(90.0, 1.0, 8_000)), BOTH)
-    reading = stage.read()
+    reading = read(on_both(scale * line(90.0, 1.0, 8_000)), 8_000)
     assert reading.frequency_hz == pytest.approx(90.0, abs=1e-4)
