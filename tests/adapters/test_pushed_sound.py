@@ -5,17 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 from camera_boxes import boxed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sound import THREE
 
 from worldstate import Listener, ListenSettings, MicrophoneArray, Odometry, PinholeCamera
-from worldstate.adapters import Model, read_model, save_model, write_array_xml
+from worldstate.adapters import Model, read_model
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
-from worldstate.cli.main import main
 from worldstate.ground import InvalidArgumentError, nanoseconds
 from worldstate.ground.typing import Float32Array
 
@@ -72,20 +70,6 @@ def test_a_skipped_loss_keeps_the_time_and_is_reported(model: Model) -> None:
     # The loss affects one window of one second.
     assert 0.8 <= max(lost_s) - min(told) / 1e9 <= 1.0
     assert list(told.values())[-1].share == 1.0
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("size", [1, 37, 480, 48_000])
-def test_pushed_states_equal_run_for_any_block_size(size, tmp_path, model, capsys) -> None:
-    save_model(tmp_path / "model.json", model)
-    write_array_xml(tmp_path / "three.xml", THREE)
-    soundfile.write(tmp_path / "sound.wav", SOUND, RATE_HZ, subtype="FLOAT")
-    options = ["--array", str(tmp_path / "three.xml"), "--model", str(tmp_path / "model.json")]
-    out = tmp_path / "states.jsonl"
-    assert main(["run", str(tmp_path / "sound.wav"), *options, "--out", str(out)]) == 0
-    listener = Listener(tmp_path / "three.xml", RATE_HZ, model=tmp_path / "model.json")
-    blocks = [*np.split(SOUND, range(size, len(SOUND), size)), None]
-    assert [one.to_json() for block in blocks for one in listener.push(block)] == out.read_text().splitlines()
 
 
 def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path, model: Model) -> None:

@@ -196,19 +196,6 @@ def one_line_of(capsys) -> str:
     return lines[0]
 
 
-def test_a_budget_that_the_curve_does_not_support_names_the_range_that_it_does(tmp_path, capsys):
-    sound = tmp_path / "sound.wav"
-    soundfile.write(sound, np.random.default_rng(0).normal(0, 0.1, (50_000, 56)), 48000)
-    for option, asked, unit in (("--alpha", 0.99, "of the hops"), ("--budget", 0.01, "onsets per hour")):
-        assert main(["run", str(sound), option, str(asked)]) == 2
-        line = one_line_of(capsys)
-        least, most = map(float, re.search(r"expected ([0-9.]+) to ([0-9.e+]+)", line).groups())
-        assert unit in line and not least <= asked <= most
-    with pytest.raises(SystemExit, match="2"):
-        main(["run", str(sound), "--alpha", "0.02", "--budget", "12"])
-    assert "not allowed with" in capsys.readouterr().err
-
-
 @pytest.fixture(scope="module")
 def ring_of_seven(tmp_path_factory):
     sound = tmp_path_factory.mktemp("ring") / "ring.wav"
@@ -267,15 +254,6 @@ def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
     assert main(["explain", str(states), "--time", f"{onset_s:.1f}"]) == 0
     assert f"since {onset_s:.2f} s" in capsys.readouterr().out
     assert (tmp_path / "t.png").read_bytes()[:4] == b"\x89PNG"
-
-
-@pytest.mark.long
-def test_own_array_and_sound_give_the_same_as_the_folder(approach, tmp_path, capsys):
-    by_folder, by_parts = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
-    assert main(["run", str(approach.folder), "--out", str(by_folder)]) == 0
-    parts = ["--array", str(approach.array_path), "--detections", str(approach.detections_path)]
-    assert main(["run", str(approach.audio_path), *parts, "--out", str(by_parts)]) == 0
-    assert by_folder.read_text() == by_parts.read_text()
 
 
 def test_the_help_names_every_exit_code(capsys):

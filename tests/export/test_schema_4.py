@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from mcap.writer import Writer
-from scripted_states import scripted_states
+from scripted_states import scripted_states, write_states
 
 from worldstate import WorldState
 from worldstate.adapters.export.log_messages import read_messages
@@ -135,8 +135,7 @@ def test_every_consumer_of_an_advisory_is_given_that_it_is_not_usable(tmp_path, 
     for calibrated in (False, True):
         states = [judged(replace(state, calibrated=calibrated)) for state in scripted_states()]
         assert any(cue.advisory for cue in states[0].cues)
-        log, page = tmp_path / "states.jsonl", tmp_path / "page.html"
-        log.write_text("".join(f"{state.to_json()}\n" for state in states))
+        log, page = write_states(tmp_path / "states.jsonl", states), tmp_path / "page.html"
         with parts["risk_table"](str(tmp_path / "risks.csv")) as export:
             export(states[0])
         rows = list(csv.DictReader((tmp_path / "risks.csv").open()))
@@ -173,8 +172,8 @@ def without_model(state: WorldState) -> WorldState:
 
 
 def test_what_has_no_side_class_or_risk_is_left_out_and_not_taken_for_zero(tmp_path, capsys):
-    states, log = [without_model(one) for one in scripted_states()], tmp_path / "states.jsonl"
-    log.write_text("".join(f"{one.to_json()}\n" for one in states))
+    states = [without_model(one) for one in scripted_states()]
+    log = write_states(tmp_path / "states.jsonl", states)
     assert [state for _, state in read_log(log)] == states and {one.risk for one in states} == {None}
     (cue,) = risk_advisories(states[0])["advisories"]
     assert cue["direction"] == "" and not cue["usable"]

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import soundfile
 from camera_boxes import boxed, write_boxes
-from made_up_sound import plane_wave
 from scipy.spatial.transform import Rotation
 
 from worldstate.adapters import read_camera, read_model, save_model
 from worldstate.adapters.vehicle.car_file import Mounting, read_car
 from worldstate.cli.main import main
-from worldstate.frontend import FrontEnd, FrontEndSettings
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 # Three-dimensional: two rings of five, one above the other.
@@ -52,16 +50,6 @@ def test_pitch_turns_camera_and_array_alike(tmp_path):
     assert Mounting(pitch_deg=20.0).applied([[1.0, 0.0, 0.0]])[0, 2] > 0.0
     lens = written(tmp_path, LENS | {"pitch_deg": 20.0, "position_m": [0, 0, 0]})
     assert read_camera(lens).pitch_rad > 0.0
-
-
-def test_bearings_of_a_tilted_array_are_in_vehicle_axes(tmp_path):
-    array, settings = (
-        read_car(written(tmp_path, CAR)).array,
-        FrontEndSettings(azimuth_span_deg=(-180.0, 180.0)),
-    )
-    sound = plane_wave(array, 16_000, math.radians(50.0), 2.0)
-    heard = FrontEnd(array, 16_000, settings).process(sound)[-1]
-    assert math.degrees(heard.bearing_rad) == pytest.approx(50.0, abs=1.0)
 
 
 def test_cameras_have_names_and_positions_relative_to_the_array(tmp_path):
