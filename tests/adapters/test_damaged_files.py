@@ -415,17 +415,6 @@ def test_a_failed_write_leaves_the_old_file_and_a_finished_one_replaces_it(tmp_p
     assert np.load(name)["value"] == 2
 
 
-def test_folders_are_written_whole_too(tmp_path: Path) -> None:
-    with atomic_path(tmp_path / "set") as temporary:
-        temporary.mkdir()
-        (temporary / "one").write_text("1")
-    with pytest.raises(RuntimeError), atomic_path(tmp_path / "other") as temporary:
-        temporary.mkdir()
-        (temporary / "one").write_text("1")
-        raise RuntimeError
-    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["set", "set/one"]
-
-
 def test_writers_refuse_a_missing_folder_and_a_folder(tmp_path: Path) -> None:
     (taken := tmp_path / "taken").mkdir()
     with pytest.raises(InputFileError, match=r"nowhere/mics.xml: expected an existing folder"):

@@ -192,9 +192,6 @@ def test_missing_permission_is_reported_before_the_work(files, capsys):
     assert "permission" in refusal(["run", "a.wav", "--out", "m.json"], files, capsys)
 
 
-# --- inputs ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suffix", [".raw", ".au", ".ogg", ".mp3", ".wav", ".npz", ""])
 @pytest.mark.parametrize("command", ["run", "array check", "model threshold"])
 def test_bytes_that_are_no_sound_give_one_line(command, suffix, tmp_path, capsys):
@@ -250,9 +247,6 @@ def test_damaged_files_are_read_or_give_one_line(name, whole, tmp_path, capsys):
     assert refused >= 2
 
 
-# --- disks -----------------------------------------------------------------------------------------------
-
-
 def one_line(done: subprocess.CompletedProcess[str]) -> str:
     assert done.returncode == 2, done
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
@@ -304,9 +298,6 @@ def test_a_closed_pipe_is_no_error():
         ["bash", "-c", f"{line} | true; exit ${{PIPESTATUS[0]}}"], capture_output=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, b"")
-
-
-# --- interruptions ---------------------------------------------------------------------------------------
 
 
 def interrupted(words: list[str], begun, number: int) -> int:
