@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from camera_boxes import EMPTY, boxed
 from made_up_sound import Fixed, plane_wave
+from street_measurements import after
 
 from worldstate import MicrophoneArray, NotUsable, WorldFilter, WorldState
 from worldstate.abduction import DomainGuard, Familiar, Foreign
@@ -195,12 +196,6 @@ def sounds() -> dict[type, np.ndarray]:
     return {Familiar: noise, Foreign: swelling, WarningSignal: tone}
 
 
-def followed(world: WorldFilter, told: list[Measurement]) -> WorldFilter:
-    for one in told:
-        world = world.update(one)
-    return world
-
-
 @pytest.mark.parametrize("kind", [Familiar, Foreign, WarningSignal])
 def test_only_foreign_sounds_lose_evidence(kind: type) -> None:
     found = unwatched(ALARMED, guard=guard()).measure(sounds()[kind])
@@ -214,7 +209,7 @@ def test_only_foreign_sounds_lose_evidence(kind: type) -> None:
     unknown = 1.0 / (1.0 + np.exp(last.domain.log_odds)) if isinstance(last.domain, Foreign) else 1.0
     assert last.heard.share == pytest.approx(plain.heard.share * unknown)
     assert (last.heard.reason == FOREIGN) == isinstance(last.domain, Foreign)
-    again = WorldState.from_json(followed(WorldFilter(), found).state.to_json())
+    again = WorldState.from_json(after(*found).state.to_json())
     assert again.domain == last.domain
     assert kind is not Foreign or again.to_dict()["domain"]["reason"] == "sounds like speech"
 
@@ -222,10 +217,10 @@ def test_only_foreign_sounds_lose_evidence(kind: type) -> None:
 def test_a_foreign_sound_is_not_taken_for_silence() -> None:
     heard = unwatched(SILENT, guard=guard()).measure(sounds()[Foreign])
     foreign = [one for one in heard if isinstance(one.domain, Foreign)]
-    warned = followed(WorldFilter(), unwatched(ALARMED).measure(sounds()[Familiar]))
+    warned = after(*unwatched(ALARMED).measure(sounds()[Familiar]))
     later = [replace(one, stamp_ns=warned.stamp_ns + 10**8 * (i + 1)) for i, one in enumerate(foreign[:5])]
-    silent = followed(warned, [replace(one, heard=Heard()) for one in later])
-    ends = silent, followed(warned, later), warned.predict_to(later[-1].stamp_ns)
+    silent = after(*(replace(one, heard=Heard()) for one in later), world=warned)
+    ends = silent, after(*later, world=warned), warned.predict_to(later[-1].stamp_ns)
     left = [one.belief.hypotheses[0] for one in ends]
     assert left[0] < 0.5 * left[2]
     assert left[1] == pytest.approx(left[2], rel=0.2)

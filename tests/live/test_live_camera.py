@@ -11,7 +11,7 @@ import pytest
 from camera_boxes import EMPTY, boxed
 from stand_ins import send, wall
 
-from worldstate import Absent, DetectionFrame, PinholeCamera, Present, Unqueried, nanoseconds
+from worldstate import Absent, DetectionFrame, PinholeCamera, Present, nanoseconds
 from worldstate.adapters import DetectionLog, RawPcm, open_source
 from worldstate.adapters.camera.vision_query import NO_LOOKS, REMEMBERED, VisionQuery
 from worldstate.adapters.live.live_sensors import CameraFeed, DetectionSocket, ImageLooks, image_channel
@@ -78,16 +78,6 @@ def test_a_parked_car_is_static_at_any_frame_rate(camera, rate_hz):
         camera.see(nanoseconds(number / rate_hz), box(300.0))
     assert [seen.moving for seen in camera.sightings(nanoseconds(2.0))] == [False]
     assert len(camera.detections) <= REMEMBERED
-
-
-def test_without_an_image_the_camera_is_unqueried(camera):
-    assert isinstance(camera.ask(0, AHEAD), Unqueried)
-    camera.see(0, EMPTY)
-    assert isinstance(camera.ask(stamp(1), AHEAD), Absent)
-    # The camera hangs, so its last image is no current look.
-    assert isinstance(camera.ask(stamp(5), AHEAD), Unqueried)
-    camera.see(stamp(5), box(260.0))
-    assert isinstance(camera.ask(stamp(5), AHEAD), Present)
 
 
 def test_looks_out_of_order_are_dropped(camera):

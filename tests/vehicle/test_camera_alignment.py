@@ -63,18 +63,17 @@ def test_intervals_contain_the_truth_and_narrow_with_passes():
 
 
 @pytest.mark.parametrize(
-    ("sides", "said"), [((1,), "12 from the left, 0 from"), ((-1,), "0 from the left, 12")]
+    ("heard", "said"),
+    [
+        (passes(12, 0.1, 2.0, sides=(1,)), "12 from the left, 0 from"),
+        (passes(12, 0.1, 2.0, sides=(-1,)), "0 from the left, 12"),
+        (passes(4, 0.0, 0.0), "expected at least 5 vehicles .* got 4"),
+        (passes(20, 0.0, 25.0, other=0.0), "at its edge: correct it by hand first"),
+    ],
 )
-def test_vehicles_from_one_side_are_not_enough(sides, said):
+def test_passes_of_one_side_too_few_and_a_large_offset_raise_an_error(heard, said):
     with pytest.raises(InvalidArgumentError, match=said):
-        align(passes(12, 0.1, 2.0, sides=sides))
-
-
-def test_too_few_passes_and_a_large_offset_raise_an_error():
-    with pytest.raises(InvalidArgumentError, match=r"expected at least 5 vehicles .* got 4"):
-        align(passes(4, 0.0, 0.0))
-    with pytest.raises(InvalidArgumentError, match="at its edge: correct it by hand first"):
-        align(passes(20, 0.0, 25.0, other=0.0))
+        align(heard)
 
 
 RINGS = [[0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [-0.1, -0.1, 0.1]]
