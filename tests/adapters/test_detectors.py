@@ -155,12 +155,9 @@ def test_another_output_is_refused(output):
         decode_yolo(output, classes=2)
 
 
-def test_a_file_that_is_no_model_is_a_typed_error(tmp_path):
+def test_a_missing_model_and_one_of_another_input_are_refused(tmp_path):
     pytest.importorskip("onnxruntime")
-    (tmp_path / "text.onnx").write_bytes(b"no model")
-    (tmp_path / "empty.onnx").write_bytes(b"")
-    for name in ("missing.onnx", "text.onnx", "empty.onnx"):
-        with pytest.raises(InputFileError, match=name):
-            open_onnx(tmp_path / name, ("car",))
+    with pytest.raises(InputFileError, match=r"missing\.onnx"):
+        open_onnx(tmp_path / "missing.onnx", ("car",))
     with pytest.raises(InvalidArgumentError, match="input"):
         OnnxDetector(Spy(shape=(1, 3)), ("car",))

@@ -161,10 +161,7 @@ def test_reference_boxes_need_one_video(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("line", "extra"),
-    [
-        ("sim make --out new --minutes 1", "matplotlib"),
-        ("sim make --out new --static 1 --video", "cv2"),
-    ],
+    [("sim make --out new --minutes 1", "matplotlib"), ("sim make --out new --static 1 --video", "cv2")],
 )
 def test_missing_packages_are_named_before_the_work(line, extra, files, capsys, monkeypatch):
     real = extras.find_spec
