@@ -122,7 +122,7 @@ def test_truncated_sound(tmp_path: Path, container: str, kept: float) -> None:
 @given(cut=st.integers(0, 400), seed=st.integers(0, 10_000))
 @settings(max_examples=40, deadline=None)
 def test_a_cut_header_is_refused_and_a_damaged_one_read_or_refused(
-    tmp_path_factory: pytest.TempPathFactory, container: str, cut: int, seed: int
+    tmp_path_factory, container: str, cut: int, seed: int
 ) -> None:
     name, rng = tmp_path_factory.mktemp("cut") / "cut", np.random.default_rng(seed)
     data = bytearray(write(name, noise(9000), container, "PCM_16").read_bytes())

@@ -11,9 +11,9 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sound import plane_wave
+from street_measurements import hop
 
-from worldstate import Listener, ListenSettings, MicrophoneArray, Unqueried, WorldFilter, WorldState
-from worldstate.abduction.evidence import SignatureEvidence
+from worldstate import Listener, ListenSettings, MicrophoneArray, WorldFilter, WorldState
 from worldstate.adapters import read_checkpoint, save_checkpoint
 from worldstate.belief.sound_tracks import MOST_SOUNDS
 from worldstate.belief.street_model import StreetModel
@@ -125,16 +125,15 @@ def test_blocks_and_checkpoints_change_nothing(tmp_path: Path) -> None:
         np.testing.assert_allclose(*azimuths, atol=1e-3)
 
 
-def measured(hop: int, azimuth_rad: float | None, at_edge: bool = False) -> Measurement:
+def measured(number: int, azimuth_rad: float | None, at_edge: bool = False) -> Measurement:
     bearing = NotUsable("-") if azimuth_rad is None else Bearing(azimuth_rad, 0.1, 2.0, at_edge)
-    even = SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
-    return Measurement(hop * 10**8, even, Unqueried("-"), bearing, NotUsable("-"))
+    return hop(number, bearing=bearing)
 
 
 def followed(azimuths_rad: list[float | None], at_edge: bool = False) -> list[WorldState]:
     world, states = WorldFilter(no_model=NotUsable("no model")), []
-    for hop, azimuth_rad in enumerate(azimuths_rad, start=1):
-        world = world.predict_to(hop * 10**8).update(measured(hop, azimuth_rad, at_edge))
+    for number, azimuth_rad in enumerate(azimuths_rad, start=1):
+        world = world.predict_to(number * 10**8).update(measured(number, azimuth_rad, at_edge))
         states.append(world.state)
     return states
 

@@ -138,9 +138,7 @@ def test_a_card_names_each_source_by_use_with_its_licence_none_stated_included(t
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_a_card_states_reality_in_words_and_the_gap_of_others_only_without_recordings_of_its_own(
-    own, tmp_path, capsys
-):
+def test_a_card_states_the_gap_of_others_only_without_recordings_of_its_own(own, tmp_path, capsys):
     gap = RealFigure("AUROC", 0.98, 0.75, 0.63, 0.87, "a car", 2, 45, "a command")
     rows = (gap, replace(gap, simulated=0.97, real=0.82, microphones=7, own=True)) if own else (gap,)
     kinds = (KindShare("bicycle", 0.0, 12), KindShare("car", 0.777, 49))

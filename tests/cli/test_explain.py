@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from street_measurements import hop
 
-from worldstate import Absent, Measurement, NotUsable, SignatureEvidence, WorldFilter, WorldState
+from worldstate import Absent, WorldFilter, WorldState
 from worldstate.abduction import Foreign, uncalibrated_policy
 from worldstate.abduction.sequence.sequence_model import GROUPS, AlarmPromise, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
@@ -17,7 +18,6 @@ from worldstate.cli.main import main
 from worldstate.measurement import Heard, Look
 from worldstate.operations.recordings.evidence_report import common_lines
 
-SILENT, FLAT = NotUsable("not scripted"), SignatureEvidence(("left", "right"), (0.0, 0.0), 0.0, 0.0)
 SHARE = np.full(len(GROUPS), 1.0 / len(GROUPS))
 
 
@@ -33,13 +33,12 @@ def states(tmp_path_factory) -> Path:
     """Write 0.5 s of an empty street, 0.5 s of a vehicle on the left and 0.5 s of speech."""
     path = tmp_path_factory.mktemp("explain") / "states.jsonl"
     world, lines = WorldFilter(), []
-    for hop in range(1, 16):
-        coming = 0.9 if 6 <= hop <= 10 else 0.01
+    for number in range(1, 16):
+        coming = 0.9 if 6 <= number <= 10 else 0.01
         said = SequenceReading(np.stack([heard(coming), heard(0.01)]), SHARE, 0.2, SequenceAlarm(1.5, 20.0))
-        look = Look("camera", hop * 10**8, Absent(0.1, 0.01))
-        domain = Foreign("sounds like speech", 1.5) if hop > 10 else None
-        hop = Measurement(hop * 10**8, FLAT, look.answer, SILENT, SILENT, (), look, domain, sequence=said)
-        world = world.update(hop)
+        look = Look("camera", number * 10**8, Absent(0.1, 0.01))
+        domain = Foreign("sounds like speech", 1.5) if number > 10 else None
+        world = world.update(hop(number, answer=look.answer, look=look, domain=domain, sequence=said))
         lines.append(world.state.to_json())
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -72,16 +71,16 @@ PROMISE = AlarmPromise(24.7, 9.1, 53.6, 0.0094, 0.0034, 0.0203)
 )
 def test_the_requested_budget_is_printed_beside_that_of_the_curve(alarm, words):
     said = SequenceReading(np.stack([heard(0.1), heard(0.01)]), SHARE, 0.2, SequenceAlarm(1.0, *alarm))
-    hop = Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, sequence=said)
-    state = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02)).update(hop).state
+    one = hop(1, answer=Absent(0.1, 0.01), sequence=said)
+    state = WorldFilter(policy=replace(uncalibrated_policy(), alpha=0.02)).update(one).state
     assert words in next(one for one in common_lines(state) if one.startswith("budget: "))
     assert {cue.alpha for cue in state.cues} == {None if len(alarm) == 1 else 0.0094}
 
 
 def test_low_recall_of_bicycles_is_printed() -> None:
     kinds = {"bicycle": 0.0, "car": 0.8}
-    hop = Measurement(10**8, FLAT, Absent(0.1, 0.01), SILENT, SILENT, heard=Heard(0.5, "wind", kinds=kinds))
-    lines = list(common_lines(WorldFilter().update(hop).state))
+    one = hop(1, answer=Absent(0.1, 0.01), heard=Heard(0.5, "wind", kinds=kinds))
+    lines = list(common_lines(WorldFilter().update(one).state))
     assert "acoustic, detected by kind (simulated exam): bicycle 0.00, car 0.40" in lines
 
 
