@@ -111,15 +111,6 @@ def test_image_and_boxes_scaled_together_change_nothing(by, height_px, step_px, 
     assert [one.moving for one in seen] == [one.moving for one in also]  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(("height_px", "least_px"), [(1216, 100.0), (402, 33.06), (608, 50.0), (2432, 200.0)])
-def test_the_least_height_scales_with_the_image(height_px: int, least_px: float) -> None:
-    keep = replace(DetectionFilter(), image_height_px=height_px)
-    frame = boxed((0.0, 0.0, 9.0, least_px - 0.1), (0.0, 0.0, 9.0, least_px + 0.1))
-    assert frame.select(keep).tolist() == [1]
-    # The sixty pixels of the laboratory refer to OVAD's images.
-    assert replace(DetectionFilter(min_height_px=60.0), image_height_px=1216).scale == 1.0
-
-
 def test_a_stated_least_height_is_of_the_cameras_own_images(tmp_path) -> None:
     for more, least_px in (({}, 100 * 480 / 1216), ({"min_box_px": 50}, 50.0)):
         (tmp_path / "camera.json").write_text(json.dumps(LENS | more))
