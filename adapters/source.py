@@ -256,7 +256,7 @@ class Source:
         """The reason why no model is used; None if one is."""
         if self.model is not None:
             return None
-        alike = ", which hears front as back" if self.array.ambiguity in ("cone", "front-back") else ""
+        alike = ", which is front-back ambiguous" if self.array.ambiguity in ("cone", "front-back") else ""
         return NotUsable(f"no model was made for this array of {self.array.n_microphones} microphones{alike}")
 
     @property
@@ -672,7 +672,7 @@ def _check_rate(log: DetectionLog, last_s: float, length_s: float) -> None:
     # If the last listed image has a box, later images without a box may not be listed.
     slow = not len(log.frames[-1]) and any(abs(rate_hz / one - 1.0) < _SAME_LENGTH for one in _SLOW_RATES_HZ)
     if slow or images / assumed_hz > length_s * (1.0 + _SAME_LENGTH) + _LONGER_S:
-        got = f"got number {images - 1} in {length_s:.1f} s of sound, as at {rate_hz:.3g} a second"
+        got = f"got number {images - 1} in {length_s:.1f} s of sound, as at {rate_hz:.3g} per second"
         way_on = "state their rate (image_rate_hz of the camera), or count them from the first sample"
         raise InputFileError(log.source, f"expected {assumed_hz:g} images a second, {got}: {way_on}")
 
@@ -748,11 +748,11 @@ def _sequence_of(model: Model, moving_ego: bool, uncalibrated: bool) -> Sequence
     if model.sequence is None:
         return NotUsable("the model states no times: `worldstate model make` makes one that does")
     if uncalibrated:
-        return NotUsable("uncalibrated: times are stated of the array that the model was made for")
+        return NotUsable("uncalibrated: times are valid only for the array of the model")
     if not model.provenance.fit_for_use:
         return NotUsable(UNFIT)
     if model.domain is None:
-        return NotUsable("the model names no array that it was made for")
+        return NotUsable("the model does not state its array")
     motion = "moving" if moving_ego else "standing"
     if model.domain.ego_motion not in (motion, "any"):
         return NotUsable(f"the model was made for a {model.domain.ego_motion} ego, this one is {motion}")

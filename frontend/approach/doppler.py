@@ -267,7 +267,7 @@ def _rejected(
     if misfit > _MOST_MISFIT:
         return NotUsable(f"the line wanders: reduced chi-squared {misfit:.1f} against a pass-by")
     if min(map(polynomial, DRIFT_DEGREES)) < beaten:
-        return NotUsable("a drifting engine explains the line as well as a pass-by")
+        return NotUsable("a change of engine speed explains the tone as well as a passing vehicle")
     return None
 
 

@@ -197,4 +197,4 @@ def _loose_axes(best_m: FloatArray, judged: Comparison) -> Iterator[str]:
         scaled = {scale: best_m * np.where(np.arange(3) == axis, scale, 1.0) for scale in OFF_BY_30}
         alike = [f"{scale:g}" for scale, one in scaled.items() if not judged.is_better(best_m, one)]
         if alike:
-            yield f"{name}: {' or '.join(alike)} times the extent fits this sound as well"
+            yield f"{name}: {' or '.join(alike)} times the extent fits the sound as well"

@@ -75,7 +75,7 @@ _DIRECT, _PARTS_OF_ONE = 0.5, 0.8
 _SIDE_RAD = math.radians(15.0)
 _ALIKE_RAD = math.radians(7.0)
 
-NO_SIDE = ("whether the array is mirrored or turned: only sound from a known side (--heard-from) shows it",)
+NO_SIDE = ("a mirrored or rotated mounting: this needs sound from a known azimuth (--heard-from)",)
 
 
 class Hypothesis:
@@ -245,7 +245,7 @@ class Comparison:
         order, unsure = self.best_order()
         size, by_chance, untold = self._best_size(order)
         if size is not None and self._is_one_wave:
-            size, untold = None, ("the size: one wave shows none to an upright array",)
+            size, untold = None, ("the size: one wave does not determine the size of an upright array",)
         if by_chance:
             return PositionVerdict(order=())
         if not np.array_equal(order, np.arange(len(order))):
@@ -309,7 +309,7 @@ class Comparison:
             and np.abs(apart[one][:, one] - apart).max() > _SAME_PLACE * np.max(apart)
         ]
         named = ", ".join(pairs[:3]) + (f" and {len(pairs) - 3} more pairs" if len(pairs) > 3 else "")
-        return (f"exchange of {named}: this sound fits both",) if pairs else ()
+        return (f"exchange of {named}: the sound fits both",) if pairs else ()
 
     def _best_size(self, order: IndexArray) -> tuple[float | None, bool, tuple[str, ...]]:
         """Return a size that fits better, whether any order fits equally, and undetermined sizes."""
@@ -326,7 +326,7 @@ class Comparison:
         if is_off:
             return off, False, ()
         unsure = [f"{one:g} times" for one in OFF_BY_30 if self._gain(energy[right], energy[one]) < SIZE_GAIN]
-        return None, False, (f"{' or '.join(unsure)} the size: this sound fits both",) if unsure else ()
+        return None, False, (f"{' or '.join(unsure)} the size: the sound fits both",) if unsure else ()
 
     def _by_chance(self, hypothesis: Hypothesis, explained: FloatArray) -> bool:
         rng = np.random.default_rng(0)
@@ -344,7 +344,8 @@ class Comparison:
         fits = misses.pop("as claimed") < max(_SIDE_RAD, least + _ALIKE_RAD)
         alike = tuple(name for name, miss in misses.items() if miss < least + _ALIKE_RAD)
         if fits:
-            return (), (f"whether it is {' or '.join(alike)}: sound from there fits both",) if alike else ()
+            both = f"whether it is {' or '.join(alike)}: sound from this azimuth fits both"
+            return (), (both,) if alike else ()
         return (alike if least < _SIDE_RAD else (_turned(heard_from_rad - at),)), ()
 
     def _places(self, heard_from_rad: float) -> dict[str, FloatArray]:

@@ -159,7 +159,7 @@ def test_tyre_noise_is_that_of_the_directive_and_constant_below_its_speeds():
     assert slow == pytest.approx(slower, abs=0.1)
 
 
-SILENT = NotUsable("nothing heard")
+SILENT = NotUsable("no sound so far")
 
 
 class Flat:

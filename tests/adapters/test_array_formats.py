@@ -205,7 +205,7 @@ def test_axes_may_be_those_of_the_other_convention(tmp_path: Path) -> None:
 def test_the_description_shows_an_array_along_the_vehicle() -> None:
     roof = roof_array_56()
     extents = "0.00 m along x (forward), 0.78 m along y (left), 0.65 m along z (up)"
-    assert stance(roof) == f"56 microphones, {extents}; hears front as back"
+    assert stance(roof) == f"56 microphones, {extents}; front-back ambiguous"
     # The roof array if base_link axes are written into a file of Acoular's form.
     sideways = MicrophoneArray(roof.positions_m[:, [2, 0, 1]] * [1.0, -1.0, 1.0])
     assert "no extent across the vehicle" in stance(sideways)

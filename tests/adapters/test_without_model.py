@@ -89,7 +89,7 @@ def test_commands_print_bearings_and_the_missing_model(tmp_path, capsys, refused
     words = [str(sound), "--array", str(mics)]
     assert main(["run", *words, "--out", str(log)]) == 0
     out = capsys.readouterr().out
-    for said in ("(no model 31)", "\nsounds                   1\n", "tells all azimuths apart"):
+    for said in ("(no model 31)", "\nsounds                   1\n", "distinguishes all azimuths"):
         assert said in out
     states = [WorldState.from_json(line) for line in log.read_text().splitlines()]
     reason = "no model was made for this array of 5 microphones"

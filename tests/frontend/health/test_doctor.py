@@ -36,7 +36,7 @@ def test_a_healthy_recording(street, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "healthy"
     assert not any(line.startswith("channel") for line in lines)
-    assert "hears front as back" in lines[1]
+    assert "front-back ambiguous" in lines[1]
 
 
 def test_array_check_lists_exactly_the_dead_channels(street, tmp_path, capsys):

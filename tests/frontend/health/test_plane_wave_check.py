@@ -140,7 +140,7 @@ def test_array_check_prints_the_delay_of_a_late_card(tmp_path, capsys):
     (row,) = (line for line in lines if "delayed" in line and "%" in line)
     assert row.split()[:2] == ["5-8", "delayed"]
     assert re.search(r"0\.(2[5-9]|3[0-5]) \+- 0\.0\d ms later than the others", row)
-    assert lines[-1] == "not healthy: delayed 5, 6, 7, 8; 4 left out by the front-end"
+    assert lines[-1] == "not healthy: delayed 5, 6, 7, 8; 4 excluded by the front-end"
 
 
 @pytest.mark.slow

@@ -98,7 +98,7 @@ def run(folder: Path, sound: np.ndarray, positions: np.ndarray, *options: str) -
 
 def test_the_command(talkers: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, talkers, ring(6, 0.045)) == 0
-    assert "mirrored or turned" in capsys.readouterr().out
+    assert "mirrored or rotated" in capsys.readouterr().out
     assert run(tmp_path, talkers, ring(6, 0.045)[[1, 0, 2, 3, 4, 5]], "--json") == 1
     report = json.loads(capsys.readouterr().out)
     assert report["condition"] == "impaired"
@@ -149,7 +149,7 @@ def test_positions_are_recovered_up_to_a_turn(around: list[np.ndarray], claimed:
     assert error_m(claimed, SQUARE) > 0.006
     assert found.explained > found.explained_before + 0.005
     assert not any("less than 4 s" in one for one in found.unjudged)
-    assert any("mirrored or turned" in one for one in found.unjudged)
+    assert any("mirrored or rotated" in one for one in found.unjudged)
     assert any(one.startswith("z: 0.77 or 1.3 times") for one in found.unjudged)
 
 
@@ -229,7 +229,7 @@ def test_the_command_writes_an_array_file(around, tmp_path, capsys):
     (tmp_path / "pasted.csv").write_text("\n".join(table))
     written = read_array(tmp_path / "fitted.xml").positions_m
     np.testing.assert_array_equal(read_array(tmp_path / "pasted.csv").positions_m, written)
-    assert "not fitted: z: 0.77 or 1.3 times" in printed
+    assert "not determined: z: 0.77 or 1.3 times" in printed
     assert error_m(read_array(tmp_path / "fitted.xml").positions_m, SQUARE) < 0.004
     assert run(tmp_path, around[0], 1.4 * SQUARE, "--fit") == 1
     assert "\nx,y,z\n" in capsys.readouterr().out

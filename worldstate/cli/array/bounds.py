@@ -52,7 +52,7 @@ def _as_table(
         "array": inputs.stance(array),
         "S_xx": f"{bounds.horizontal_moment_m2:.4g} m^2",
         "alias-free to": f"{bounds.alias_hz:.0f} Hz (mean spacing {100 * bounds.mean_spacing_m:.1f} cm)",
-        "cannot tell apart": bounds.ambiguity,
+        "indistinguishable": bounds.ambiguity,
         "broadside": f"azimuth {bounds.broadside_deg:.3g} deg",
         "bearing": f"standard deviation in degrees at {bounds.frequency_hz:g} Hz, and for N = {N} "
         f"and SNR {', '.join(f'{level:g}' for level in levels)} dB",
@@ -64,5 +64,5 @@ def _as_table(
         each = "  ".join(f"{bounds.at(azimuth, level, N):.3g}" for level in levels)
         table[f"  azimuth {azimuth:g} deg"] = f">= {constant:.3g} / sqrt(2 N SNR)   {each}"
     speeds = "  ".join(f"{bounds.radial_speed_std_m_s(level):.3g}" for level in levels)
-    table["radial speed"] = f"m/s, from a tone of {bounds.frequency_hz:g} Hz heard for a second   {speeds}"
+    table["radial speed"] = f"m/s, from a tone of {bounds.frequency_hz:g} Hz measured for a second   {speeds}"
     return table

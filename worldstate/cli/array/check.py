@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> output.CommandResult:
         better = f"explain {fit.explained:.3f} of the coherent sound, those given {fit.explained_before:.3f}"
         far = f"channel {moved_mm.argmax() + 1} moves farthest, by {moved_mm.max():.0f} mm"
         lines += [f"fit: these positions {better}; {far}", *text.splitlines()]
-        lines += [f"not fitted: {one}" for one in fit.unjudged]
+        lines += [f"not determined: {one}" for one in fit.unjudged]
         report = report | {"fit": encode(fit)}
     if arguments.figure is not None:
         channel_report.write_array_figure(array, health, arguments.figure)

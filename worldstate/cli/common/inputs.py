@@ -293,7 +293,7 @@ def stance(array: "frontend.MicrophoneArray") -> str:
     --------
     >>> from worldstate.frontend.array.microphone_array import MicrophoneArray
     >>> stance(MicrophoneArray([[0, 0.2, 1.4], [0, -0.2, 1.4]]))
-    '2 microphones, 0.00 m along x (forward), 0.40 m along y (left), 0.00 m along z (up); hears front as back'
+    '2 microphones, 0.00 m along x (forward), 0.40 m along y (left), 0.00 m along z (up); front-back ...'
     """
     x, y, z = array.aperture_m.tolist()
     extent = f"{x:.2f} m along x (forward), {y:.2f} m along y (left), {z:.2f} m along z (up)"
@@ -302,11 +302,11 @@ def stance(array: "frontend.MicrophoneArray") -> str:
 
 def _apart(x: float, y: float, ambiguity: str) -> str:
     if ambiguity in ("none", "up-down"):
-        return "tells all azimuths apart"
+        return "distinguishes all azimuths"
     if x < _FLAT_M:
-        return "hears front as back"
+        return "front-back ambiguous"
     if y < _FLAT_M:
         return (
-            "hears left as right: no extent across the vehicle; if that is wrong, check the axes of the file"
+            "left-right ambiguous: no extent across the vehicle; if that is wrong, check the axes of the file"
         )
-    return "hears a direction as its mirror image in the array"
+    return "each direction has a mirror image in the array"

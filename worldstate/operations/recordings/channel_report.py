@@ -204,7 +204,7 @@ class HealthLog:
         """Return the verdicts so far."""
         latest = self._latest
         dropouts, count = tuple(self._dropouts[:_LISTED_DROPOUTS]), latest.n_dropouts if latest else 0
-        coherence = latest.coherence if latest else NotUsable("nothing heard")
+        coherence = latest.coherence if latest else NotUsable("no sound so far")
         unheard = next((why for why in ARRAY_FAULTS if 2 * self._unheard[why] > self._n_hops), None)
         return RecordingHealth(self._verdicts(), dropouts, count, coherence, unheard=unheard)
 
@@ -315,7 +315,7 @@ def as_text(health: RecordingHealth, audio: Audio, array: MicrophoneArray, stanc
 
 
 def _table(verdicts: tuple[ChannelVerdict, ...]) -> Iterator[str]:
-    yield f"{'channel':>7}  {'fault':<12}  {'since':>6}  {'hops':>5}  what and what to do"
+    yield f"{'channel':>7}  {'fault':<12}  {'since':>6}  {'hops':>5}  finding and remedy"
     for _, card in itertools.groupby(enumerate(verdicts), _card):
         each = [verdict for _, verdict in card]
         first, last = each[0], each[-1].channel + 1
@@ -330,23 +330,26 @@ def _card(numbered: tuple[int, ChannelVerdict]) -> object:
     return number if verdict.std is None else (verdict.channel - number, verdict.fault, verdict.value)
 
 
+_MEND = "exchange the plugs or the lines of the array file"
+
+
 def _advice(verdict: ChannelVerdict) -> str:
     value, std = verdict.value, verdict.std or 0.0
     other = (verdict.looks_like or 0) + 1
     late = f"{1e3 * abs(value):.2f} +- {1e3 * std:.2f} ms"
     drift = f"{1e6 * abs(value):.0f} +- {1e6 * std:.0f}"
     return {
-        Fault.DEAD: "silent: check plug, cable, phantom power",
-        Fault.INTERMITTENT: f"out or crackling in {100 * value:.0f} % of the time: check plug and cable",
-        Fault.NOISY: f"{100 * max(value, 0):.0f} % of the usual coherence: own noise, or another place",
-        Fault.INVERTED: "polarity is reversed: cross its two leads",
-        Fault.SWAPPED: f"fits the place of channel {other}: exchange plugs, or the lines of the array file",
-        Fault.CLIPPED: f"{100 * value:.2g} % of samples at its limit, impaired: lower the gain",
-        Fault.OFFSET: f"mean is {100 * value:.0f} % of the peak-to-peak sound: check bias and coupling",
-        Fault.LEVEL: f"{value:+.0f} dB against the median channel: check gain and sensitivity",
-        Fault.GUSTS: f"loud by itself in {100 * value:.0f} % of ten seconds, wind: fit a windscreen",
+        Fault.DEAD: "no signal: check the plug, the cable and the phantom power",
+        Fault.INTERMITTENT: f"no signal or crackling {100 * value:.0f} % of the time: check plug and cable",
+        Fault.NOISY: f"{100 * max(value, 0):.0f} % of the usual coherence: own noise or another position",
+        Fault.INVERTED: "polarity reversed: exchange its two leads",
+        Fault.SWAPPED: f"fits the position of channel {other}: {_MEND}",
+        Fault.CLIPPED: f"{100 * value:.2g} % of the samples are clipped: lower the gain",
+        Fault.OFFSET: f"mean is {100 * value:.0f} % of the peak-to-peak amplitude: check bias and coupling",
+        Fault.LEVEL: f"{value:+.0f} dB relative to the median channel: check gain and sensitivity",
+        Fault.GUSTS: f"louder than the others in {100 * value:.0f} % of ten seconds: fit a windscreen",
         Fault.DELAY: f"{late} {_when(value)} than the others: start the cards together, by one trigger",
-        Fault.DRIFT: f"{drift} us a second {_when(value)}: a clock of its own, connect the word clocks",
+        Fault.DRIFT: f"{drift} us per second {_when(value)}: its own clock: connect the word clocks",
     }[verdict.fault]
 
 
@@ -358,21 +361,21 @@ def _position_lines(positions: PositionVerdict) -> Iterator[str]:
     if positions.order is not None:
         yield f"positions: {_order_text(positions.order)}"
     if positions.size is not None:
-        better = f"{positions.size:.3g} times the size given fits better"
-        yield f"positions: {better}: check the radius, and the unit"
+        better = f"{positions.size:.3g} times the given size fits better"
+        yield f"positions: {better}: check the radius and the unit"
     if positions.mounting:
-        yield f"mounting: {' or '.join(positions.mounting)}: the sound comes from another side than was said"
-    yield from (f"not judged: {unjudged}" for unjudged in positions.unjudged)
+        fits = " or ".join(positions.mounting)
+        yield f"mounting: {fits}: the sound does not come from the azimuth of --heard-from"
+    yield from (f"not decided: {unjudged}" for unjudged in positions.unjudged)
 
 
 def _order_text(order: tuple[int, ...]) -> str:
     moved = [str(channel + 1) for channel, place in enumerate(order) if channel != place]
-    mend = "exchange plugs, or the lines of the array file"
     if len(moved) == 2:
-        return f"channels {' and '.join(moved)} are exchanged: {mend}"
+        return f"channels {' and '.join(moved)} are exchanged: {_MEND}"
     if moved:
-        return f"channels stand in places {', '.join(str(place + 1) for place in order)}: {mend}"
-    return "the sound fits no better in this order than in any: check the order of the array file"
+        return f"the channels belong to the positions {', '.join(str(place + 1) for place in order)}: {_MEND}"
+    return "the sound fits no better in this order than in a random one: check the order of the array file"
 
 
 def _other_lines(health: RecordingHealth) -> Iterator[str]:
@@ -382,11 +385,11 @@ def _other_lines(health: RecordingHealth) -> Iterator[str]:
         count = "1 dropout" if health.n_dropouts == 1 else f"{health.n_dropouts} dropouts"
         yield f"{count} ({shown}{more}): check the recorder's buffers"
     if (rate := health.sample_rate) is not None:
-        ppm = f"{rate.rate_hz:.2f} +- {rate.std_hz:.2f} Hz, {1e6 * rate.error:+.0f} millionths off"
+        ppm = f"{rate.rate_hz:.2f} +- {rate.std_hz:.2f} Hz, {1e6 * rate.error:+.0f} ppm off"
         wrong = ": the header is wrong, or samples are missing" if rate.is_wrong else ""
         yield f"sample rate by the other clock: {ppm}{wrong}"
     if isinstance(health.coherence, NotUsable):
-        yield f"inverted and noisy microphones, swapped ones of many not judged: {health.coherence.reason}"
+        yield f"inverted, noisy and swapped microphones not tested: {health.coherence.reason}"
 
 
 def _conclusion(health: RecordingHealth) -> str:
@@ -395,7 +398,7 @@ def _conclusion(health: RecordingHealth) -> str:
         kinds.setdefault(verdict.fault.value, set()).add(verdict.channel + 1)
     parts = [f"{kind} {', '.join(map(str, sorted(found)))}" for kind, found in kinds.items()]
     parts += [f"{health.unheard} ({_CAUSES[health.unheard]})"] if health.unheard else []
-    parts += [] if health.positions.fits else ["sound and positions do not belong together"]
+    parts += [] if health.positions.fits else ["the sound contradicts the positions"]
     masked = len(health.masked_channels)
-    left_out = f"; {masked} left out by the front-end" if masked else ""
+    left_out = f"; {masked} excluded by the front-end" if masked else ""
     return f"not healthy: {'; '.join(parts) or 'see above'}{left_out}"
