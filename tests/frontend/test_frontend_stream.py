@@ -325,3 +325,14 @@ def test_the_number_of_threads_does_not_change_a_bit() -> None:
             frames.append(FrontEnd(array, 16_000).process(sound)[0])
     np.testing.assert_array_equal(frames[0].srp, frames[1].srp)
     np.testing.assert_array_equal(frames[0].feature, frames[1].feature)
+
+
+def test_mirrored_world_and_array_mirror_the_frame() -> None:
+    array = roof_array_56()
+    mirrored = MicrophoneArray(array.positions_m * [1.0, -1.0, 1.0])
+    left = FrontEnd(array, 48_000).process(noise_from(array, 0.6, 48_000, 1.0))[0]
+    right = FrontEnd(mirrored, 48_000).process(noise_from(mirrored, -0.6, 48_000, 1.0))[0]
+    np.testing.assert_allclose(right.srp, left.srp[::-1], rtol=1e-4)
+    assert right.bearing_rad == pytest.approx(-left.bearing_rad, abs=1e-4)
+    mirrored_feature = right.feature.reshape(2, 30)[:, ::-1].ravel()
+    np.testing.assert_allclose(mirrored_feature, left.feature, rtol=1e-3)

@@ -13,7 +13,9 @@ from simulated_sound import (
     OPEN,
     PAIR,
     C,
+    at,
     band_power,
+    carried,
     error_db,
     noise,
     rendered,
@@ -406,3 +408,12 @@ def test_the_weights_of_places_sum_to_one(heard_x: list[float], step_m: float) -
         mean[span] += share * place_m
     np.testing.assert_allclose(total, 1.0)
     np.testing.assert_allclose(mean, x, atol=1e-9)
+
+
+def test_a_moving_ego_has_the_waveform_of_its_changing_distance():
+    """The tone of a static source with its delay, level and Doppler shift."""
+    street = street_of(OPEN, ONE, 2.0, FS, EgoMotion(8.0, 10.0))
+    (found,) = carried(street, source_in(street, tone(1000.0), at(20.0, 3.0)))
+    time = np.arange(len(found)) / FS
+    distance = np.sqrt((20.0 - street.receiver.ego.x_m(time)) ** 2 + 3.0**2 + 1.4**2)
+    assert error_db(found, tone(1000.0)(time - distance / C) / distance) < -60.0

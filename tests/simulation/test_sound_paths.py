@@ -320,6 +320,14 @@ def test_a_driving_ego_passes_a_source_in_its_street():
     assert error_db(found, expected) < -30.0
 
 
+def level_steps_db(plan: Site, way, speed_mps: float, seconds: float) -> np.ndarray:
+    """Return changes of level per tenth of a second along a route."""
+    (found,) = heard(plan, lambda time: way.at(speed_mps * time), seconds, sound=tones)
+    tenth = int(0.1 * COARSE_FS)
+    power = (found[: len(found) // tenth * tenth].reshape(-1, tenth) ** 2).mean(axis=1)
+    return np.diff(10 * np.log10(power))
+
+
 # Each takes half a second, so they are not shrunk.
 @settings(max_examples=4, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.floats(1.2, 1.8), st.floats(3.0, 4.5), st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
@@ -330,10 +338,7 @@ def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, ar
     across, lane = side * beside, STREET.corner_ahead_m + beyond
     turn = (lane - 0.4, across + arm * 0.2), (lane, arm * 3.2)
     way = along(((-4.0, across), (3.0, across), *turn, (lane, arm * 9.0)))
-    (found,) = heard(STREET, lambda time: way.at(1.5 * time), 10.0, sound=tones)
-    tenth = int(0.1 * COARSE_FS)
-    power = (found[: len(found) // tenth * tenth].reshape(-1, tenth) ** 2).mean(axis=1)
-    steps = np.abs(np.diff(10 * np.log10(power)))
+    steps = np.abs(level_steps_db(STREET, way, 1.5, 10.0))
     lit = np.abs(way.at(0.15 * (np.arange(len(steps)) + 2.0))[1]) < 3.3
     assert steps[lit].max() < 1.8
     assert steps.max() < 2.5
@@ -379,3 +384,11 @@ def test_in_the_full_scene_most_hidden_windows_peak_at_the_sides():
     hidden = np.isin(table.labels, ("left", "right"))
     shares = {name: beyond[hidden & (table.environments == name)].mean() for name in SITES}
     assert np.mean(list(shares.values())) >= 0.6, shares
+
+
+@settings(max_examples=4, deadline=None, phases=(Phase.generate,))  # Half a second each
+@given(st.floats(3.6, 9.0), st.booleans())
+def test_the_level_is_continuous_past_a_wall_in_the_open(off, hidden):
+    """The route is behind the wall and past its end, or before it with its image."""
+    y = 2.6 + off if hidden else 1.0 - off
+    assert np.abs(level_steps_db(MERGE, along(((-9.0, y), (18.0, y))), 4.0, 6.0)).max() < 1.5

@@ -193,3 +193,24 @@ def test_an_unusable_tone_has_its_reason() -> None:
 def test_level_does_not_matter(scale: float) -> None:
     reading = read(on_both(scale * line(90.0, 1.0, 8_000)), 8_000)
     assert reading.frequency_hz == pytest.approx(90.0, abs=1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("snr_db", [0.0, 10.0, 25.0])
+def test_variance_of_samples_meets_the_bound(snr_db):
+    """Within 1.5 dB of eq. (9) of Rife and Boorstyn, never below it beyond three standard errors."""
+    rng = np.random.default_rng(int(snr_db) + 4)
+    n, trials, eta = 256, 800, 10 ** (snr_db / 10)
+    t, errors, claimed, found = np.arange(n) / SAMPLES_HZ, [], [], []
+    for _ in range(trials):
+        frequency, phase = rng.uniform(40, 460), rng.uniform(-np.pi, np.pi)
+        wave = np.cos(2 * np.pi * frequency * t + phase)
+        tone = estimate_tone(wave + rng.normal(size=n) * np.sqrt(1 / (2 * eta)), SAMPLES_HZ)
+        errors.append(tone.frequency_hz - frequency)
+        claimed.append(tone.frequency_std_hz**2)
+        found.append(tone.snr)
+    bound = tone_crb_hz2(eta, n, SAMPLES_HZ)
+    ratio_db = 10 * np.log10(np.mean(np.square(errors)) / bound)
+    assert 10 * np.log10(1 - 3 * np.sqrt(2 / trials)) < ratio_db < 1.5
+    assert np.mean(claimed) == pytest.approx(bound, rel=0.05)
+    assert np.median(found) == pytest.approx(eta, rel=0.05)

@@ -105,7 +105,7 @@ def test_the_command(talkers: np.ndarray, tmp_path: Path, capsys: pytest.Capture
     assert not report["positions"]["fit"]
     limit = float(talkers.std())
     assert run(tmp_path, talkers.clip(-limit, limit), ring(6, 0.045)) == 1
-    assert "impaired" in capsys.readouterr().out
+    assert "not healthy: clipped 1, 2, 3, 4, 5, 6" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("divisor", [39.37, 25.0])
@@ -237,3 +237,14 @@ def test_the_command_writes_an_array_file(around, tmp_path, capsys):
     assert "ends in .csv or .xml" in capsys.readouterr().err
     assert run(tmp_path, around[0], SQUARE, "--also", "other.wav") == 2
     assert "expected --fit" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_three_plane_waves_give_the_positions_from_any_start(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    there = rng.permutation(HEXAGON) if seed else HEXAGON
+    turn = rng.uniform(-180.0, 180.0)
+    claimed = HEXAGON + rng.normal(0.0, 0.01, (6, 3)) * [1.0, 1.0, 0.0]
+    found = fitted([waves(there, (turn, turn + 100.0, turn + 220.0))], claimed)
+    assert error_m(found.positions_m, there) < 0.001 < 0.01 < error_m(claimed, there)
+    assert found.explained > 0.97 > found.explained_before

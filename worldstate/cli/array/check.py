@@ -5,7 +5,7 @@ offsets, levels, wind, sound cards with a delay or a clock of their own, missing
 sample rate. Channels are counted from 1. The sound is also compared with the positions, which shows exchanged
 channels, another order or an array of another size.
 
-Sound alone cannot show that an array is mirrored or turned: give the true azimuth of one sound with
+Sound alone cannot show that an array is mirrored or rotated: give the true azimuth of one sound with
 --heard-from DEG, in degrees, left positive.
 
 --fit estimates positions that explain the sound better than those of --array, in any order and of any size,
