@@ -48,7 +48,7 @@ slow: $(VENV)/.test
 
 # Check that the core's tests detect a wrong sign, factor or order.
 mutations: $(VENV)/.test
-	$(BIN)/python tests/core/run_mutations.py
+	$(BIN)/python tests/core/test_mutations.py
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

@@ -12,14 +12,13 @@ from street_measurements import SILENT, car, hop
 from worldstate import Context, FilterSettings, Sighting, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
-from worldstate.abduction.cueing.risk_map import IsotonicMap, PlattMap
+from worldstate.abduction.cueing.risk_map import IsotonicMap
 from worldstate.abduction.evidence import statistic
 from worldstate.belief.street_model import StreetModel
 from worldstate.core.acoustic_update import acoustic_update
 from worldstate.core.site_model import site_geometry_of
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.measurement import Approach, Bearing, Look
-from worldstate.state import Priors
+from worldstate.measurement import Approach, Bearing
 
 QUIET = (0.1, 0.1, 0.1, 0.7)
 SILENCE = (0.01, 0.01, 0.01, 0.97)
@@ -178,18 +177,6 @@ def test_two_vehicles_one_seen_and_one_hidden():
     assert end[0].id in first
 
 
-def test_two_hidden_vehicles_hand_over_to_their_own_sides():
-    """If vehicles are usual on both sides, evidence of both sides makes two entities."""
-    both, busy = (0.49, 0.49, 0.01, 0.01), Context(hidden_by_side={"left": 0.8, "right": 0.8})
-    script = [measured(t, both) for t in hops(1.0, 4.0)]
-    script += [measured(t, both, car(0.5), car(-0.5)) for t in hops(4.0, 4.5)]
-    _, states = run(start(context=busy), script)
-    before = {e.direction: e.id for e in states[-6].entities}
-    assert set(before) == {"left", "right"}
-    seen = [e for e in states[-1].entities if e.status == "visible"]
-    assert {("left" if e.azimuth_rad > 0 else "right"): e.id for e in seen} == before
-
-
 def test_a_faint_belief_is_not_handed_over():
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, SILENCE) for t in hops(4.0, 7.0)]
     settings_ = FilterSettings(street=StreetModel(death=1e-3))
@@ -240,14 +227,6 @@ def test_a_visible_vehicle_does_not_raise_the_next_hidden_one():
         assert entity.existence_probability == pytest.approx(belief.hidden_on(None), abs=0.03)
 
 
-def test_a_moving_car_drives_past_a_parked_one():
-    script = [measured(t, FRONT, car(0.4 - 0.2 * (t - 1.0)), car(0.0, moving=False)) for t in hops(1.0, 5.0)]
-    _, states = run(start(), script)
-    first, last = ({e.moving: e.id for e in s.entities} for s in (states[0], states[-1]))
-    assert first == last
-    assert len(states[-1].entities) == 2
-
-
 @pytest.mark.parametrize("answer", [Absent(0.04), Absent(0.3), Absent(0.9), Unqueried("no frame")])
 def test_empty_looks_follow_the_bernoulli_update(answer):
     """One look per correlation time counts in full: r (1 - pd) / (1 - r pd), times survival."""
@@ -271,15 +250,6 @@ def test_looks_within_a_correlation_time_count_in_part():
         odds = r / (1 - r) * 0.04 ** (1 / 3)
         r = odds / (1 + odds)
     assert world.state.entities[0].existence_probability == pytest.approx(r)
-
-
-def test_a_hand_over_lowers_the_risk():
-    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
-    script.append(measured(4.0, LEFT, car(0.5), answer=Unqueried("sector out of view")))
-    _, states = run(start(), script)
-    assert states[-2].risk > 0.7
-    assert states[-1].risk < 1.0 / 6.0  # As often another one follows
-    assert states[-1].cues[0].hypotheses.visible > 0.7
 
 
 @given(st.floats(0.01, 0.99), st.floats(0.01, 0.5))
@@ -313,31 +283,6 @@ def test_a_hidden_entity_stays_on_its_side_for_any_looming(rates, azimuth):
     hidden = [e for s in states for e in s.entities]
     assert hidden
     assert all(0.2 < e.azimuth_rad < 1.7 and 0.17 < e.azimuth_std_rad < 0.8 for e in hidden)
-
-
-@given(st.floats(0.02, 0.49), st.floats(0.51, 0.98), st.sampled_from([Unqueried("-"), Absent(0.2)]))
-def test_risk_rises_with_the_posterior_and_is_the_map_of_the_statistic(low, high, answer):
-    """The risk after the first window is the map of P(hidden), which is eq. (6) without a look.
-
-    A look also counts against a visible vehicle beside a hidden one, here with probability 0.5.
-    """
-    policy = replace(POLICY, risk_map=PlattMap(-1.3, 0.4))
-    certain = FilterSettings(street=StreetModel(works=1.0))  # The camera works
-    beta, risks = 1.0 if isinstance(answer, Unqueried) else answer.miss_rate, []
-    for share in (low, high):
-        m = measured(1.0, (share / 2, share / 2, (1 - share) / 2, (1 - share) / 2), answer=answer)
-        m = replace(m, look=Look("camera", m.stamp_ns, answer))
-        world = WorldFilter(Context(priors=Priors(0.5, 0.25, 0.25)), policy, certain).update(m)
-        s = statistic(m.signature, m.co_evidence, policy.reference_prior)
-        weights = np.array([share, (1 - share) / 2, (1 - share) / 2]) * [0.5 + 0.5 * beta, beta, 1.0]
-        hidden = weights[0] / weights.sum()
-        assert beta < 1.0 or hidden == pytest.approx(s)
-        assert world.belief.hypotheses == pytest.approx(weights / weights.sum())
-        assert (world.state.cues[0].statistic, world.risk) == pytest.approx(
-            (s, min(policy.risk_map(hidden), hidden))
-        )
-        risks.append(world.risk)
-    assert risks[0] < risks[1]
 
 
 def test_overlapping_bearings_are_not_counted_twice():
