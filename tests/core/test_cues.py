@@ -164,12 +164,6 @@ def test_a_high_risk_without_sound_has_its_reason() -> None:
     assert silent.not_advised == "nothing was measured for a second"
 
 
-def test_a_snapshot_holds_no_more_than_64_events() -> None:
-    many = tuple(Position((5.0 + one, 0.0), ((0.01, 0.0), (0.0, 0.01))) for one in range(100))
-    state = WorldFilter().update(PositionScan("lidar", 10**9, many)).state
-    assert (len(state.entities), len(state.events)) == (100, 64)
-
-
 def test_a_pass_is_born_handed_over_coasts_and_dies() -> None:
     worlds = run(WorldFilter(), passing(20, 30, LOUD, SILENCE, turns=0.05, hops=120))
     told = [one for world in worlds for one in world.state.events]

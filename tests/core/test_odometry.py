@@ -14,7 +14,6 @@ from street_measurements import after, car, diagonal, hop, reading
 from worldstate import Context, Measurement, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
-from worldstate.adapters.camera.detections import read_any_detections
 from worldstate.adapters.files.odometry_file import OdometryRecord, read_odometry
 from worldstate.belief.association import reached_edge
 from worldstate.belief.hidden_bearing import hidden_motion
@@ -208,13 +207,3 @@ def test_an_unwrapped_yaw_of_a_localiser_is_wrapped(turns, yaw_rad, told_as, tmp
         told = OdometryRecord(5.0, 0.0, 5.4e6, 6.9e5, counted).at(0)  # UTM
     assert told.speed_mps == 5.0 and told.pose is not None
     assert told.pose.yaw_rad == pytest.approx(yaw_rad, abs=1e-9)
-
-
-@pytest.mark.slow
-def test_an_hour_of_odometry_and_of_images_is_read(tmp_path) -> None:
-    lines = (f"{i / 100},{5 + i % 7 / 10},{i * 0.05:.3f},0.1,{i * 1e-3:.4f}\n" for i in range(360_000))
-    (tmp_path / "ego.csv").write_text("time_s,speed_mps,x_m,y_m,yaw_rad\n" + "".join(lines))
-    assert len(read_odometry(tmp_path / "ego.csv").told) == 360_000
-    image = {"boxes": [[100.5, 200.5, 300.5, 400.5]] * 3, "scores": [0.9] * 3, "classes_str": ["car"] * 3}
-    (tmp_path / "d.json").write_text(json.dumps({"detections_per_frame": [image] * 108_000}))
-    assert len(read_any_detections(tmp_path / "d.json", 30.0)) == 108_000

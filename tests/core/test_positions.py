@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from street_measurements import ABSENT, PRESENT, SEEDS, after, car, diagonal, hop, reading
 
 from worldstate import Context, FilterSettings, Measurement, Sighting, WorldFilter, WorldState
-from worldstate.abduction.co_evidence import Absent, Present
+from worldstate.abduction.co_evidence import Absent
 from worldstate.belief.hidden_bearing import time_to_visible
 from worldstate.belief.kinematics.cartesian import CartesianBelief, polar_motion, update_bearing
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.street_model import StreetModel
-from worldstate.belief.track import Tracks
 from worldstate.measurement import Odometry, Position, PositionScan, SearchedSector, Sector
 from worldstate.state.context import corner_at
 
@@ -187,16 +186,6 @@ def test_an_announced_vehicle_keeps_its_identity_when_detected() -> None:
         assert world.state.risk < 0.2
 
 
-@pytest.mark.parametrize("clutter", [1e-300, 1e-9])
-def test_tiny_clutter_rates_keep_existence_a_probability(clutter: float) -> None:
-    there = Position((20.0, 2.0), diagonal(0.3, 0.3, 0.3, 0.3), (0.0, 0.0))
-    scans = [radar(t, there, clutter_rate=clutter) for t in (0.5, 1.0, 1.5)]
-    world = after(*scans, replace(heard(1.6, boxes=(car(0.1, 0.03),)), co_evidence=Present(0.0, clutter)))
-    for found in (world, after(radar(2.0), world=world)):
-        (entity,) = found.state.entities
-        assert 0.3 < entity.existence_probability <= 1.0
-
-
 def test_a_message_is_associated_with_the_hidden_vehicle() -> None:
     world = after(*[heard(at / 10, left=4.0) for at in range(1, 15)])
     (before,) = world.state.entities
@@ -205,17 +194,6 @@ def test_a_message_is_associated_with_the_hidden_vehicle() -> None:
     assert (joined.id, joined.status) == (before.id, "hidden")
     assert joined.existence_probability > before.existence_probability
     np.testing.assert_allclose(joined.position_m, (10.0, 27.4, 0.0), atol=1e-9)
-
-
-def test_a_message_of_tiny_existence_keeps_existence_a_probability() -> None:
-    world = after(*(heard(0.1 * at, left=500.0) for at in range(1, 12)))
-    (certain,) = world.memory.tracks.rows()
-    there = replace(certain, existence=1.0)
-    world = replace(world, memory=replace(world.memory, tracks=Tracks.of([there])), lag=None)
-    x, y = 20.0 * math.cos(there.motion.azimuth_rad), 20.0 * math.sin(there.motion.azimuth_rad)
-    denied = Position((x, y), diagonal(0.5, 0.5), existence_probability=1e-300)
-    for entity in world.update(radio(1.2, denied)).state.entities:
-        assert 0.0 <= entity.existence_probability <= 1.0
 
 
 def test_a_forged_visible_claim_is_refuted_despite_repetition() -> None:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from worldstate import Absent, Unqueried, nanoseconds
+from worldstate import nanoseconds
 from worldstate.belief.street_model import StreetModel
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "v2x_beacon.py"
@@ -56,22 +56,6 @@ def test_a_beacon_of_implausible_power_makes_no_entity(v2x):
     state = last(v2x.run(far_too_weak, v2x.ScriptedCamera([], t0_s=0.0)))
     assert state.cues[0].hypotheses.none > 0.9
     assert state.entities == ()
-
-
-def test_the_camera_query_follows_the_claimed_class(v2x):
-    asked = []
-
-    def ask(stamp_ns, bearing, expected_labels=None, side=None):
-        asked.append(set(expected_labels))
-        return Absent(0.1)
-
-    spy = SimpleNamespace(ask=ask, sightings=lambda stamp_ns: (), last_look=lambda stamp_ns: None)
-    beacon = v2x.approach_from_left()[0]
-    adapter = v2x.BeaconAdapter(vision=spy)
-    kinds = ["passenger car", "truck", "pedestrian", "spaceship"]
-    answers = [adapter.measure([replace(beacon, station=kind)])[0].co_evidence for kind in kinds]
-    assert asked == [{"car"}, {"truck", "bus"}]
-    assert [type(answer) for answer in answers] == [Absent, Absent, Unqueried, Unqueried]
 
 
 @pytest.mark.parametrize("example", ["v2x_beacon.py", "own_loop.py"])
