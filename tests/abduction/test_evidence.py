@@ -1,4 +1,4 @@
-"""Laws 1 to 4 of the one-step posterior with gtsam as its oracle, the vote of a bearing, window classes."""
+"""Laws 1 to 4 of the posterior, its statistic and threshold, with gtsam as an oracle; votes, policies."""
 
 import gtsam
 import numpy as np
@@ -9,6 +9,14 @@ from hypothesis.extra import numpy as hnp
 from scipy.special import logsumexp
 
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
+from worldstate.abduction.cueing.cueing_policy import (
+    CueingPolicies,
+    CueingPolicy,
+    sustained_alarm,
+    sustained_statistic,
+)
+from worldstate.abduction.cueing.risk_map import PlattMap
+from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.evidence import SignatureEvidence, abduce, log_lambda, statistic, with_bearing_vote
 from worldstate.abduction.signature.window_classes import (
     CLASSES,
@@ -17,6 +25,7 @@ from worldstate.abduction.signature.window_classes import (
     side_ratios,
     window_evidence,
 )
+from worldstate.ground.errors import InvalidArgumentError
 
 nats = st.floats(-300, 300)
 open_unit = st.floats(1e-6, 1 - 1e-6)
@@ -202,3 +211,40 @@ def test_four_classes_give_side_ratios_against_visible_and_none(posterior, prior
     np.testing.assert_allclose(evidence.sides.log_ratios, above, atol=1e-9)
     assert (evidence.sides.both, evidence.sides.direct) == (0.0, 0.0)
     np.testing.assert_array_equal(explained(posterior[None], CLASSES, prior)[0], posterior)
+
+
+# Few distinct values, so that ties are common.
+scores = st.sampled_from(np.linspace(0, 1, 9).tolist())
+streams = st.lists(st.lists(scores, min_size=1, max_size=30), min_size=1, max_size=6)
+hops = st.integers(1, 5)
+PRIOR = (0.25, 0.25, 0.25, 0.25)
+
+
+@given(st.lists(st.booleans(), max_size=40), hops)
+def test_an_alarm_needs_consecutive_hops_above_the_threshold(held, k):
+    by_hand = [t + 1 >= k and all(held[t + 1 - k : t + 1]) for t in range(len(held))]
+    assert sustained_alarm(held, k).tolist() == by_hand
+
+
+def alarm_rate(recordings, gamma, k):
+    return np.concatenate([sustained_alarm(np.array(r) >= gamma, k) for r in recordings]).mean()
+
+
+@given(streams, st.floats(0, 0.99), hops)
+def test_law_4_the_threshold_is_the_smallest_within_the_budget(recordings, alpha, k):
+    gamma = neyman_pearson_threshold(recordings, alpha, k)
+    assert alarm_rate(recordings, gamma, k) <= alpha + 1e-12
+    # The smallest: the next lower score that occurs would break the budget.
+    lower = [s for r in recordings for s in sustained_statistic(r, k) if s < gamma and np.isfinite(s)]
+    if lower:
+        assert alarm_rate(recordings, max(lower), k) > alpha
+
+
+def test_policies_are_found_by_budget():
+    made = [CueingPolicy(a, 1, a, PRIOR, PlattMap(-1.0, 0.0), b) for a in (0.01, 0.02) for b in (0.0, 1.0)]
+    policies = CueingPolicies(tuple(made))
+    assert policies.for_alpha(0.02, 1.0) is made[3]
+    with pytest.raises(InvalidArgumentError, match=r"0\.01, 0\.02"):
+        policies.for_alpha(0.03)
+    with pytest.raises(InvalidArgumentError, match=r"miss_rate: expected .* \(0, 1\), got 0\.5"):
+        policies.for_alpha(0.02, 0.5)

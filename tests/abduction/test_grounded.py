@@ -103,17 +103,6 @@ def test_each_coupling_can_be_switched_off_and_matters_when_on(name):
     np.testing.assert_allclose(none.evidence.log_likelihoods, SCORES.log_likelihoods, atol=1e-9)
 
 
-def test_contradicting_observables_are_less_likely():
-    speed = 10.0
-    spacing, shape = (float(c.expected([speed])[0, 0]) for c in (engine_line(), tyre_noise_shape()))
-    agreeing = seen(line_spacing_hz=(spacing, 1.0), tyre_shape_db=(shape, 1.0), doppler_ratio=(1.060, 0.002))
-    contradicting = seen(
-        line_spacing_hz=(spacing, 1.0), tyre_shape_db=(shape, 1.0), doppler_ratio=(1.001, 0.002)
-    )
-    first, second = (ground(SCORES, one, [car()]).evidence.hidden[0] for one in (agreeing, contradicting))
-    assert first > second + 3.0
-
-
 @given(st.floats(-1.4, 1.4), st.floats(0.02, 0.5))
 def test_a_bearing_changes_the_visible_likelihood_only(azimuth, std):
     observation = GroundedObservation(bearing_rad=Observable(azimuth, std))

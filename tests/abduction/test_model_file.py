@@ -18,7 +18,7 @@ from worldstate.abduction.signature.published_signature import SignatureModel
 from worldstate.adapters.files import array_file
 from worldstate.adapters.files.array_file import named_arrays, read_array
 from worldstate.adapters.files.file_io import MAX_BYTES, refused_as_file
-from worldstate.adapters.files.model_file import KindShare, Model, RealFigure, read_model, save_model
+from worldstate.adapters.files.model_file import Model, read_model, save_model
 from worldstate.belief.street_model import Number, StreetModel, StreetNumbers
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray
@@ -89,19 +89,12 @@ def test_a_tree_with_a_single_leaf_is_read_from_a_file(tmp_path):
     np.testing.assert_array_equal(read.yes, alone["yes"])
 
 
-def test_the_shipped_model_is_complete_and_has_its_provenance():
+def test_the_shipped_model_has_its_provenance_and_ordered_thresholds():
     model = read_model()
-    assert isinstance(model.signature, EnsembleModel)
-    assert model.signature.n_features == 60
-    assert {p.alpha for p in model.policies.policies} == {0.01, 0.02, 0.05}
-    assert {p.miss_rate for p in model.policies.policies} == {0.0, 1.0}
-    assert {"both", "direct"} <= set(model.signature.classes)
-    assert model.sequence is not None and model.guard is not None and model.road_users is not None
-    assert "Schulz" in model.provenance.dataset
-    assert len(model.provenance.excluded_lists) == 2
+    assert isinstance(model.signature, EnsembleModel) and model.provenance.dataset
+    assert None not in (model.sequence, model.guard, model.road_users)
     # All listeners of a process share the arrays, so they are read-only.
     assert read_model().sequence is model.sequence and not model.sequence.trees.split.flags.writeable
-    assert model.policies.for_alpha(0.02).reference_prior == model.signature.reference_prior
     thresholds = [model.policies.for_alpha(alpha).gamma for alpha in (0.05, 0.02, 0.01)]
     assert thresholds == sorted(thresholds)
 
@@ -113,24 +106,6 @@ def test_a_caller_cannot_change_the_shipped_model_of_another():
     once.provenance.figures["accuracy"] = once.provenance.exam["detected"] = 2.0
     assert read_model().provenance.figures["accuracy"] < 1.0
     assert again.provenance.figures["accuracy"] < 1.0 and again.provenance.exam["detected"] <= 1.0
-
-
-UNIT, NAME, COUNT = st.floats(0.0, 1.0), st.text(max_size=20), st.integers(0, 1000)
-KINDS = st.builds(KindShare, NAME, UNIT, COUNT)
-REAL = st.builds(RealFigure, NAME, UNIT, UNIT, UNIT, UNIT, NAME, COUNT, COUNT, NAME, st.booleans())
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20, deadline=None)
-@given(st.lists(KINDS).map(tuple), st.lists(REAL).map(tuple), st.dictionaries(NAME, UNIT))
-def test_exam_figures_are_written_and_absent_from_files_of_version_1_8(tmp_path, kinds, real, exam):
-    origin = replace(published().provenance, kinds=kinds, real=real, exam=exam)
-    save_model(tmp_path / "m.json.gz", replace(published(), provenance=origin))
-    assert read_model(tmp_path / "m.json.gz").provenance == origin
-    former = encode(replace(published(), provenance=origin))
-    former["schema"]["version"] = "1.8.0"
-    for name in ("kinds", "real", "exam"):
-        del former["provenance"][name]
-    assert read(former).provenance == replace(origin, kinds=(), real=(), exam={})
 
 
 @pytest.mark.parametrize("made", [published, read_model])
@@ -215,12 +190,6 @@ def test_the_numbers_of_the_belief_come_back_with_their_sources(tmp_path):
         read(DEFAULT | {"street": encode(StreetNumbers({"look_s": replace(fitted, unit="ms")}))})
 
 
-def test_a_file_without_a_street_model_uses_the_shipped_one():
-    data = {key: value for key, value in DEFAULT.items() if key != "street"}
-    assert read(data).street is None
-    assert WorldFilter().settings.street == StreetModel() == read_model().street
-
-
 @given(st.dictionaries(st.sampled_from(sorted(StreetModel().described)), st.floats(0.01, 0.9), min_size=1))
 @settings(max_examples=20, deadline=None)
 def test_a_checkpoint_holds_the_numbers_of_its_street(values):
@@ -260,17 +229,6 @@ def test_a_number_that_would_overflow_is_refused(path, tmp_path):
             read_model(tmp_path / "m.json")
 
 
-TEXTS = "", "{", "[]", "null", "NaN", '{"a": NaN}', "[" * 99_999, "\x00", "\x80", '{"schema": 1}', "1" * 9999
-
-
-@pytest.mark.parametrize("text", TEXTS)
-def test_a_text_that_is_no_model_is_refused(tmp_path, text):
-    path = tmp_path / "no.json"
-    path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputFileError, match=r"no\.json"):
-        read_model(path)
-
-
 def test_missing_and_huge_files_are_refused(tmp_path):
     huge = tmp_path / "huge.json"
     with huge.open("wb") as file:
@@ -278,9 +236,3 @@ def test_missing_and_huge_files_are_refused(tmp_path):
     for path in (huge, tmp_path / "missing.json", tmp_path):
         with pytest.raises(InputFileError, match=path.name):
             read_model(path)
-
-
-def test_a_failed_write_leaves_no_file(tmp_path):
-    with pytest.raises(InputFileError):
-        save_model(tmp_path / "nowhere" / "m.json", read_model())
-    assert list(tmp_path.iterdir()) == []

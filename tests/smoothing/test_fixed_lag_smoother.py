@@ -276,18 +276,3 @@ def test_an_overtaking_vehicle_passes_only_the_edge_of_its_side(side):
     track = SmoothedTrack("car", np.arange(15) * HOP_NS, MotionBelief.stacked(passed))
     assert track.first_sight(-side, -0.55 * side, 0.04) is None
     assert track.first_sight(side, 0.55 * side, 0.04).time_s == pytest.approx(1.3, abs=0.01)
-
-
-@pytest.mark.slow
-def test_memory_and_graph_stay_bounded_for_an_hour():
-    import tracemalloc
-
-    def grown(hours: float) -> tuple[int, int, int]:
-        tracemalloc.start()
-        slots = slots_of_a_street(round(3600.0 * hours / HOP_S), np.random.default_rng(0))
-        return *tracemalloc.get_traced_memory(), slots
-
-    _, peak_early, slots_early = grown(0.02)
-    _, peak_late, slots_late = grown(1.0)
-    assert slots_late < 1.3 * slots_early
-    assert peak_late < peak_early + 5e6
