@@ -204,15 +204,6 @@ def test_evidence_of_both_sides_raises_each_side():
     assert hidden[0] == pytest.approx(hidden[1], abs=0.1)
 
 
-@given(shares(4), shares(4))
-def test_four_classes_give_side_ratios_against_visible_and_none(posterior, prior):
-    evidence = window_evidence(posterior[None], CLASSES, prior)
-    above = np.array(evidence.hidden) - np.logaddexp(evidence.visible, evidence.none)
-    np.testing.assert_allclose(evidence.sides.log_ratios, above, atol=1e-9)
-    assert (evidence.sides.both, evidence.sides.direct) == (0.0, 0.0)
-    np.testing.assert_array_equal(explained(posterior[None], CLASSES, prior)[0], posterior)
-
-
 # Few distinct values, so that ties are common.
 scores = st.sampled_from(np.linspace(0, 1, 9).tolist())
 streams = st.lists(st.lists(scores, min_size=1, max_size=30), min_size=1, max_size=6)

@@ -15,11 +15,9 @@ from worldstate.abduction.sequence.sequence_model import (
     GROUPS,
     HORIZONS_S,
     BoostedTrees,
-    SequenceModel,
     SequencePosterior,
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
-from worldstate.commissioning.stream_exam import smoothed_log_odds
 from worldstate.ground.serialisation import decode, encode
 from worldstate.ground.values import NotUsable
 
@@ -45,16 +43,6 @@ def test_inputs_show_a_second_rise_after_the_loudest_hop() -> None:
     assert found == [pytest.approx(4.0), pytest.approx(-1.5), pytest.approx(1.5)]
 
 
-def test_a_model_may_use_only_the_first_inputs() -> None:
-    stump = {"split": [[0, 0, 0]], "threshold": [[0.5, 0.0, 0.0]], "yes": [[1, 1, 2]], "no": [[2, 1, 2]]}
-    trees = BoostedTrees(**stump, value=[[0.0, -1.0, 1.0]], tree_class=[0], baseline=[0.0] * len(GROUPS))  # type: ignore[arg-type]
-    heard, share = evidence_of(np.random.default_rng(1), 20), np.full(len(GROUPS), 1.0 / len(GROUPS))
-    before = SequenceModel(trees, share, inputs=INPUTS[:46])
-    np.testing.assert_array_equal(
-        before.posterior(heard).groups, SequenceModel(trees, share).posterior(heard).groups
-    )
-
-
 @pytest.mark.long
 @given(SEEDS, st.integers(1, 900))
 def test_levels_are_relative_to_a_quantile_of_the_last_minute(seed: int, hops: int) -> None:
@@ -75,14 +63,6 @@ def test_probabilities_rise_with_the_horizon_and_times_are_ordered(seed: int) ->
     assert within.shape == (20, 2, len(HORIZONS_S)) and (np.diff(within, axis=-1) >= -1e-12).all()
     assert (within >= 0.0).all() and (within <= 1.0 + 1e-12).all()
     assert (times[..., 0] <= times[..., 2]).all() and (times[..., 0] >= 0.0).all()
-
-
-@pytest.mark.parametrize("hops", [0, 1, 2])
-def test_a_stream_shorter_than_the_smoothing_has_one_value_per_hop(hops: int) -> None:
-    certain = np.zeros((hops, 2, len(GROUPS)))
-    certain[:, 0, 0] = certain[:, 1, -1] = 1.0  # A vehicle from the left, none from the right
-    smoothed = smoothed_log_odds(SequencePosterior(certain, 0.0))
-    np.testing.assert_array_equal(smoothed > 0.0, np.tile([True, False], (hops, 1)))
 
 
 @settings(max_examples=30, deadline=None)

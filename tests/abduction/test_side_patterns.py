@@ -19,7 +19,6 @@ from worldstate.abduction.sequence.street_sides import (
     SidePatterns,
     StreetHearing,
     StreetListener,
-    arrival_pattern,
 )
 from worldstate.adapters.files.acoustic_domain import heard_with
 from worldstate.adapters.files.model_file import read_model
@@ -85,13 +84,6 @@ def test_patterns_need_both_arms_and_gain_weight_with_passes():
     of_the_left = np.exp(np.repeat(SLOPE, 5))[None]
     told = [float(learned(passes[: 2 * n]).sides().log_ratio(of_the_left)[0]) for n in (1, 8)]
     assert 0.0 < told[0] < told[1] < 3.0
-
-
-def test_a_silent_pass_changes_nothing():
-    passes = passes_of(np.random.default_rng(3), 4)
-    known = learned(passes)
-    silent = PassSound(np.tile(SLOPE, (30, 1)), np.zeros(30), "roof")
-    assert known.with_pass("right", silent) == known
 
 
 def test_patterns_of_another_array_are_not_used(caplog):
@@ -193,8 +185,3 @@ def test_a_street_keeps_patterns_and_forgets_them_slowly():
     later = forgotten(street, 30 * 86400.0).patterns
     assert later.weights == pytest.approx(tuple(3.0 * np.exp(-1.0) for _ in range(2)))
     assert later.sides().certainty < street.patterns.sides().certainty
-
-
-def test_a_pattern_does_not_depend_on_the_level():
-    feature = np.random.default_rng(7).lognormal(0.0, 1.0, (4, 60))
-    np.testing.assert_allclose(arrival_pattern(7.0 * feature), arrival_pattern(feature), atol=1e-12)

@@ -152,20 +152,17 @@ def test_simulated_junctions_stay_whichever_site_is_held_out():
 
 @pytest.mark.parametrize("other_side", [0.0, OTHER_SIDE])
 def test_a_share_of_a_simulated_hazard_is_labelled_with_the_other_side(other_side):
-    # One pattern that no real window has: the posterior is the share of each label by weight.
+    # One pattern that no real window has: the posterior is the share of each label by weight. A symmetric one
+    # would be equally likely on both sides.
     rng, n = np.random.default_rng(9), 300
     X, y = windows(rng, n)
     X, sites = X[y != "left"], np.repeat("SA1", n - n // 4)
     left = np.tile(np.hstack([np.full(60, 50.0), np.zeros(180)]), (n, 1))
+    left[:, :20] = 400.0
     rest = np.tile(np.hstack([np.full(60, 1.0), np.zeros(180)]), (2, 1))
     labels = np.concatenate([np.repeat("left", n), ["front", "none"]])
     at, shares = np.repeat("SA1", n + 2), (np.full(n + 2, 1.0), np.full(n + 2, other_side))
     more = SimulatedWindows(np.concatenate([left, rest]), labels, at, *shares)
-    model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
-    assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([0.5, 0.5], abs=0.02)
-    # This pattern is symmetric, so both sides are equally likely. An asymmetric one shows the share.
-    left[:, :20] = 400.0
-    more = replace(more, X=np.concatenate([left, rest]))
     model = SiteEnsembleClassifier((Recipe("mean", 1e-5),), more).fit(X, y[y != "left"], sites).model_
     assert model.predict_proba(left[:1])[0, [1, 3]] == pytest.approx([1.0 - other_side, other_side], abs=0.05)
 
@@ -243,19 +240,16 @@ def test_a_learned_reference_excludes_the_scored_recording(recording, label):
         np.testing.assert_array_equal(before[row].level, after[row].level)
 
 
-def test_learning_needs_hazard_free_windows_or_starts_empty():
+def test_learning_needs_hazard_free_windows_of_two_recordings_or_starts_empty():
     labels, sites, recordings, features = made_up_junctions()
     labels = ["left" if name == "none" else name for name in labels]
     streets = table(labels, sites, recordings, features)
+    with pytest.raises(InvalidArgumentError, match="SA1/0"):
+        with_site_references(table(["none"] * 2, ["SA1"] * 2, ["0", "0"], np.ones((2, 60))))
     with pytest.raises(InvalidArgumentError, match="hazard-free"):
         learned_while_listening(streets, np.random.default_rng(0))
     learned = learned_while_listening(streets, np.random.default_rng(0), or_nothing=True)
     assert {one.heard_s for one in learned} == {0.0}
-
-
-def test_a_site_with_one_recording_has_no_reference():
-    with pytest.raises(InvalidArgumentError, match="SA1/0"):
-        with_site_references(table(["none"] * 2, ["SA1"] * 2, ["0", "0"], np.ones((2, 60))))
 
 
 def test_likelihoods_are_finite_far_from_the_training_data(trained):
@@ -314,8 +308,10 @@ def test_an_estimate_is_the_exponentially_weighted_mean(n, dt_s, forgetting_s):
     assert estimate.heard_s <= forgetting_s + dt_s
 
 
-def test_an_empty_estimate_gives_the_default_reference(model):
+def test_a_first_window_has_the_default_reference(model):
     assert SiteEstimate.start(60).reference(model) is model.home
+    window = np.random.default_rng(3).uniform(0.1, 1.0, 60)
+    assert SiteSignature(model).evidence(window) == model.evidence(window)
     at_home = listened(np.tile(np.exp(model.empty), (50, 1)))
     np.testing.assert_allclose(at_home.reference(model), model.home, atol=1e-9)
 
@@ -344,11 +340,6 @@ def test_a_checkpoint_continues_exactly(model):
     second = SiteSignature(model, estimate=decode(SiteEstimate, saved, "file"))
     answers = [whole.evidence(window) for window in windows]
     assert [second.evidence(window) for window in windows[10:]] == answers[10:]
-
-
-def test_a_window_is_compared_with_earlier_ones_only(model):
-    window = np.random.default_rng(3).uniform(0.1, 1.0, 60)
-    assert SiteSignature(model).evidence(window) == model.evidence(window)
 
 
 @pytest.mark.parametrize("bad", [np.full(60, np.nan), np.ones(59)])

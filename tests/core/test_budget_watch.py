@@ -158,13 +158,6 @@ def test_without_a_camera_the_budget_is_unwatched() -> None:
     assert WorldFilter().state.budget is None
 
 
-def test_the_mirrored_street_and_renamed_sensors_have_the_same_budget() -> None:
-    here = budgets(false_alarms(hops=300))
-    assert here[-1].tally.false_onsets > 2
-    assert budgets(false_alarms(mirrored=True, hops=300)) == here
-    assert budgets([replace(one, source="ear") for one in false_alarms("another", hops=300)]) == here
-
-
 def test_checkpoints_and_late_measurements_leave_the_budget_unchanged() -> None:
     measured = list(false_alarms(hops=400))
     here = budgets(measured)

@@ -9,19 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from street_measurements import SILENT, car, hop
 
-from worldstate import Context, FilterSettings, Sighting, SignatureEvidence, WorldFilter
+from worldstate import FilterSettings, Sighting, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap
-from worldstate.abduction.evidence import statistic
 from worldstate.belief.street_model import StreetModel
-from worldstate.core.acoustic_update import acoustic_update
-from worldstate.core.site_model import site_geometry_of
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Approach, Bearing
 
 QUIET = (0.1, 0.1, 0.1, 0.7)
-SILENCE = (0.01, 0.01, 0.01, 0.97)
 LEFT = (0.97, 0.01, 0.01, 0.01)
 RIGHT = (0.01, 0.97, 0.01, 0.01)
 FRONT = (0.01, 0.01, 0.97, 0.01)
@@ -123,16 +118,6 @@ def test_looming_gives_the_time_to_arrival_or_it_is_unknown():
     assert (entity.inverse_tta_hz, entity.tta_s, world.state.cues[0].horizon_s) == (None, None, None)
 
 
-def test_an_old_approach_rate_fades():
-    """Approach at 0.8 1/s, then visible for three seconds without an approach rate."""
-    script = [measured(t, LEFT, approach=Approach(0.8, 0.1)) for t in hops(1.0, 4.0)]
-    script += [measured(t, FRONT, car(0.4)) for t in hops(4.0, 7.0)]
-    _, states = run(start(), script)
-    assert states[29].entities[0].tta_s < 2.0
-    assert states[-1].entities[0].tta_s is None
-    assert abs(states[-1].entities[0].inverse_tta_hz) < 0.4
-
-
 def test_a_hidden_azimuth_includes_the_possible_bias():
     peak = Bearing(0.6, 0.06, 1.4)
     world, _ = run(start(), [measured(t, LEFT, bearing=peak) for t in hops(1.0, 6.0)])
@@ -177,16 +162,6 @@ def test_two_vehicles_one_seen_and_one_hidden():
     assert end[0].id in first
 
 
-def test_a_faint_belief_is_not_handed_over():
-    script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, SILENCE) for t in hops(4.0, 7.0)]
-    settings_ = FilterSettings(street=StreetModel(death=1e-3))
-    world, states = run(WorldFilter(policy=POLICY, settings=settings_), script)
-    (faint,) = states[-1].entities
-    assert faint.existence_probability < 0.02
-    world = world.update(measured(7.0, SILENCE, car(-0.5)))
-    assert {e.status: e.id == faint.id for e in world.state.entities}["visible"] is False
-
-
 def test_hysteresis_keeps_one_id_through_a_dip():
     script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, QUIET) for t in hops(4.0, 4.6)]
     script += [measured(t, LEFT) for t in hops(4.6, 7.0)]
@@ -209,22 +184,6 @@ def test_a_parked_car_drives_off():
     assert {e.id for s in states for e in s.entities} == {entity.id}
     assert (entity.moving, entity.azimuth_rad) == (True, pytest.approx(-0.24, abs=0.03))
     assert entity.azimuth_rate_rad_s == pytest.approx(-0.6, abs=0.1)
-
-
-def test_a_visible_vehicle_does_not_raise_the_next_hidden_one():
-    """A visible vehicle has a track; the existence of the next one is only its hidden probability."""
-    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
-    in_view = [car(0.5 - 0.3 * (t - 4.0)) for t in hops(4.0, 7.5)]
-    script += [measured(t, FRONT, one) for t, one in zip(hops(4.0, 5.5), in_view, strict=False)]
-    script += [measured(t, LEFT, one) for t, one in zip(hops(5.5, 7.5), in_view[15:], strict=True)]
-    world, next_ones = start(), []
-    for measurement in script:
-        world = world.update(measurement)
-        if world.stamp_ns > 4 * 10**9:
-            next_ones += [(e, world.belief) for e in world.state.entities if e.status == "hidden"]
-    assert len(next_ones) > 10 and len({e.id for e, _ in next_ones}) == 1
-    for entity, belief in next_ones:
-        assert entity.existence_probability == pytest.approx(belief.hidden_on(None), abs=0.03)
 
 
 @pytest.mark.parametrize("answer", [Absent(0.04), Absent(0.3), Absent(0.9), Unqueried("no frame")])
@@ -283,42 +242,6 @@ def test_a_hidden_entity_stays_on_its_side_for_any_looming(rates, azimuth):
     hidden = [e for s in states for e in s.entities]
     assert hidden
     assert all(0.2 < e.azimuth_rad < 1.7 and 0.17 < e.azimuth_std_rad < 0.8 for e in hidden)
-
-
-def test_overlapping_bearings_are_not_counted_twice():
-    """Ten tenths of a window count about as one window, for the azimuth slightly more.
-
-    Each hop associates the peak with the entity again; one window does this once.
-    """
-    loud = SignatureEvidence(("left", "right"), (12.0, 0.0), 0.0, 0.0)
-    script = [replace(measured(t, LEFT), signature=loud) for t in hops(1.0, 4.0)]
-    world, _ = run(start(), script)
-    m = measured(4.0, LEFT, bearing=Bearing(0.9, 0.06), approach=Approach(0.5, 0.2))
-    (track,) = world.memory.tracks.rows()
-    once, often = world.memory.draft(), world.memory.draft()
-    site = site_geometry_of(Context(), FilterSettings())
-    acoustic_update(once, m, 1.0, site)
-    for _ in range(10):
-        acoustic_update(often, m, 0.1, site)
-    for row, most in ((0, 0.4), (2, 0.2)):
-        one, ten = (memory.tracks.covariance[0, row, row] for memory in (once, often))
-        none = track.motion.covariance[row, row]
-        assert ten == pytest.approx(one, rel=most)
-        assert one < 0.9 * none
-
-
-def test_a_measurement_of_other_directions_raises_an_error_without_effect():
-    world = start().update(measured(2.0, LEFT))
-    before, other = world.state, SignatureEvidence(("north",), (0.0,), 0.0, 0.0)
-    with pytest.raises(InvalidArgumentError, match="expected one of the directions"):
-        world.update(replace(measured(2.1, LEFT), signature=other))
-    assert world.state == before
-
-
-def test_a_policy_for_other_directions_uses_equal_priors():
-    m = measured(1.0, LEFT)
-    world = WorldFilter(policy=replace(POLICY, reference_prior=(0.25, 0.25, 0.5))).update(m)
-    assert world.state.cues[0].statistic == pytest.approx(statistic(m.signature, m.co_evidence, (0.25,) * 4))
 
 
 def test_the_same_run_has_the_same_ids():

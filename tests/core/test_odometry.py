@@ -1,6 +1,5 @@
 """Ego motion: standing objects move in the axes of the ego vehicle, and a passed corner hides nothing."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -22,7 +21,6 @@ from worldstate.belief.kinematics.motion import MotionBelief
 from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
 from worldstate.belief.track import born
-from worldstate.cli.main import main
 from worldstate.core.site_model import FilterModel, from_here, site_geometry_of
 from worldstate.ground.errors import InputFileError
 from worldstate.measurement import CameraLook, Look, Position, PositionScan
@@ -173,25 +171,6 @@ def test_errors_of_an_odometry_csv_have_the_line(tmp_path, text: str, words: str
     path.write_text("time_s,speed_mps" + text)
     with pytest.raises(InputFileError, match=words):
         read_odometry(path)
-
-
-def test_a_run_with_odometry_drives_up_to_the_corner(approach, tmp_path) -> None:
-    context, ego, out = tmp_path / "c.json", tmp_path / "ego.csv", tmp_path / "states.jsonl"
-    arms = [
-        {"direction": "left", "corner_m": [20.0, 4.0], "crossing_m": 24.0},
-        {"direction": "right", "corner_m": [20.0, -4.0], "crossing_m": 24.0},
-    ]
-    context.write_text(json.dumps({"arms": arms}))
-    ego.write_text("time_s,speed_mps\n" + "".join(f"{0.1 * k:.1f},1.5\n" for k in range(100)))
-    files = {"--context": context, "--odometry": ego, "--out": out}
-    options = (str(one) for pair in files.items() for one in pair)
-    assert main(["run", str(approach.folder), *options]) == 0
-    states = [json.loads(line) for line in out.read_text().splitlines()]
-    for state in (states[0], states[-1]):
-        x = 1.5 * state["stamp_ns"] * 1e-9
-        assert state["ego"]["position_m"] == pytest.approx([x, 0.0], abs=1e-6)
-        edge = state["context"]["occluders"][0]["edge_azimuth_rad"]
-        assert edge == pytest.approx(math.atan2(4.0, 20.0 - x), abs=1e-6)
 
 
 @given(
