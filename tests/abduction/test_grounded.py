@@ -13,7 +13,6 @@ from scipy.stats import norm
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.abduction.grounding.grounded_likelihood import (
     BACKGROUNDS,
-    LINE_SPACING,
     Descriptor,
     GroundedObservation,
     GroundedSettings,
@@ -25,13 +24,8 @@ from worldstate.abduction.grounding.grounded_likelihood import (
     motorcycle,
     tyre_noise_shape,
 )
-from worldstate.adapters.acoustic import AcousticAdapter, observe
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import ListenSettings, open_source
-from worldstate.frontend.approach.looming import Looming
-from worldstate.frontend.approach.tone import ToneReading
-from worldstate.frontend.array.microphone_array import roof_array_56
-from worldstate.ground.values import NotUsable
 
 SCORES = SignatureEvidence(("left", "right"), (0.7, -0.4), 0.1, -0.2)
 NAMES = ("line_spacing_hz", "tyre_shape_db", "doppler_ratio")
@@ -132,36 +126,6 @@ def test_tyre_noise_is_that_of_the_directive_and_constant_below_its_speeds():
     assert tyre_noise_shape().expected([70.0 / 3.6])[0, 0] == pytest.approx(high - low, abs=0.02)
     slow, slower = tyre_noise_shape().expected([20.0 / 3.6 - 0.5, 1.0])[0]
     assert slow == pytest.approx(slower, abs=0.1)
-
-
-SILENT = NotUsable("no sound so far")
-
-
-class Flat:
-    def evidence(self, feature):
-        return SCORES
-
-
-@pytest.fixture(scope="module")
-def frame(approach):
-    """One frame with a bearing, a looming rate and an engine line, whatever the recording has there."""
-    frame, _ = next(iter(measure_steps(open_source(approach.folder))))
-    looming = Looming(inverse_tta_hz=0.4, std_hz=0.05, log_slope_hz=0.8)
-    tone = ToneReading(57.0, 0.3, 0.5)
-    return replace(frame, bearing_rad=0.2, bearing_std_rad=0.05, prominence=2.0, looming=looming, tone=tone)
-
-
-def test_each_measurement_carries_its_own_spread(frame):
-    measurement = AcousticAdapter(roof_array_56(), 48_000.0, Flat()).interpret(frame)
-    assert measurement.signature is SCORES  # grounding is off by default
-    seen = observe(frame, measurement.bearing, measurement.approach)
-    assert (seen.bearing_rad.value, seen.bearing_rad.std) == pytest.approx((0.2, 0.05))
-    assert (seen.inverse_tta_hz.value, seen.inverse_tta_hz.std) == (0.4, 0.05)
-    assert (seen.signature[LINE_SPACING].value, seen.signature[LINE_SPACING].std) == (57.0, 0.3)
-    none = observe(replace(frame, tone=SILENT), SILENT, SILENT)
-    assert not none.signature
-    assert none.bearing_rad is SILENT
-    assert none.inverse_tta_hz is SILENT
 
 
 @pytest.mark.long

@@ -316,15 +316,6 @@ def test_a_first_window_has_the_default_reference(model):
     np.testing.assert_allclose(at_home.reference(model), model.home, atol=1e-9)
 
 
-@given(st.floats(-1.0, 1.0), st.integers(0, 100))
-def test_a_quarter_of_the_level_and_the_whole_pattern_move_the_reference(model, level, seed):
-    pattern = np.random.default_rng(seed).normal(size=60)
-    pattern -= pattern.mean()
-    estimate = SiteEstimate(model.empty + level + pattern, heard_s=10.0)
-    shift = estimate.reference(replace(model, prior_s=0.0)) - model.home
-    np.testing.assert_allclose(shift, np.tile(0.25 * level + pattern, 3), atol=1e-9)
-
-
 def test_the_mirrored_street_mirrors_the_reference(model):
     windows = np.random.default_rng(1).uniform(0.1, 1.0, (20, 60))
     there, back = (listened(w).reference(model) for w in (windows, mirror_features(windows)))

@@ -193,13 +193,6 @@ def test_a_forged_visible_claim_is_refuted_despite_repetition() -> None:
     assert after(*(one for pair in told for one in pair)).state.entities[0].existence_probability > 0.7
 
 
-def test_a_position_is_published_only_while_it_is_precise() -> None:
-    world = after(*[radio(at / 10, crossing(at / 10 - 40.0)) for at in range(1, 5)])
-    later = [world.predict(wait_s).state.entities for wait_s in (0.0, 2.0, 4.5, 7.0)]
-    told = [[one.position_m is not None for one in entities] for entities in later]
-    assert told == [[True], [True], [False], []]
-
-
 def test_two_cars_that_meet_keep_their_identities() -> None:
     """They pass 1 m apart at 10 m/s; position errors of 0.5 m alone would confuse them."""
     ids, world = set(), WorldFilter()
