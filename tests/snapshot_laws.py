@@ -64,6 +64,9 @@ def _chances(state: WorldState) -> Iterator[str]:
         chances = [*(cue.within or {}).values(), cue.risk + SLACK]
         if chances != sorted(chances):
             yield f"{cue.direction}: chances that do not rise up to the risk: {chances}"
+        low_s, _, high_s = cue.time_to_visible_s or (0.0, 0.0, 0.0)
+        if not 0.0 <= low_s <= high_s:
+            yield f"{cue.direction}: times to visible of {cue.time_to_visible_s}"
 
 
 def _advisories(state: WorldState) -> Iterator[str]:

@@ -7,7 +7,7 @@ import numpy as np
 from street_measurements import EVEN, car, hop, reading
 
 from worldstate import Measurement
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.measurement import Look
 
@@ -29,15 +29,11 @@ def heard(number: int, loud: str | None, answer: CoEvidence, level: float = 20.0
     return hop(at, nats, answer=answer, look=look, sequence=said)
 
 
-def false_alarms(
-    camera: str | None = "camera", mirrored: bool = False, hops: int = 500
-) -> Iterator[Measurement]:
+def false_alarms(hops: int = 500) -> Iterator[Measurement]:
     """Yield a false alarm of 0.4 s every 4 s on alternating sides."""
-    answer = Unqueried("no camera") if camera is None else Absent(0.04, 0.01)
     for number in range(1, hops):
-        side = SIDES[(number // 40 + mirrored) % 2] if number % 40 < 4 else None
-        one = heard(number, side, answer)
-        yield one if camera is None else replace(one, look=Look(camera, one.stamp_ns, answer))
+        side = SIDES[number // 40 % 2] if number % 40 < 4 else None
+        yield heard(number, side, Absent(0.04, 0.01))
 
 
 def arrival(first: int, level: float = 20.0) -> Iterator[Measurement]:

@@ -39,13 +39,6 @@ def test_class_probabilities_are_a_softmax(seed: int, measured: list[float]) -> 
     assert dict(said) == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_class_recovers_from_a_share_of_zero() -> None:
-    shares = np.array([0.5, 0.3, 0.2])
-    one = replace(model(), shares=shares)
-    again = one.with_shares(np.array([0.7, 0.0, 0.3])).with_shares(shares)
-    np.testing.assert_allclose(again.biases, one.biases, atol=1e-9)
-
-
 @given(st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3), st.floats(-5.0, 5.0), st.floats(0.05, 0.999))
 def test_the_likeliest_set_is_minimal_and_a_siren_keeps_its_odds(parts, log_odds, mass):
     shares = tuple(zip(sorted(CLASSES), (np.array(parts) / sum(parts)).tolist(), strict=True))

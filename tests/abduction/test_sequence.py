@@ -12,10 +12,7 @@ from scipy.linalg import expm
 from worldstate.abduction.sequence.markov_chain import balanced, transitions
 from worldstate.abduction.sequence.sequence_inputs import INPUTS, sequence_inputs
 from worldstate.abduction.sequence.sequence_model import (
-    GROUPS,
-    HORIZONS_S,
     BoostedTrees,
-    SequencePosterior,
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceHistory, SequenceReader, SequenceReading
 from worldstate.ground.serialisation import decode, encode
@@ -53,16 +50,6 @@ def test_levels_are_relative_to_a_quantile_of_the_last_minute(seed: int, hops: i
         for value, (values, share) in zip(found[at], pairs, strict=True):
             usual = np.quantile(values[max(at - 599, 0) : at + 1], share, method="lower")
             assert value == values[at] - usual
-
-
-@given(SEEDS)
-def test_probabilities_rise_with_the_horizon_and_times_are_ordered(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    said = SequencePosterior(rng.dirichlet(np.full(len(GROUPS), 0.5), (20, 2)), margin_s=0.2)
-    within, times = said.within(), said.time_to_visible_s()
-    assert within.shape == (20, 2, len(HORIZONS_S)) and (np.diff(within, axis=-1) >= -1e-12).all()
-    assert (within >= 0.0).all() and (within <= 1.0 + 1e-12).all()
-    assert (times[..., 0] <= times[..., 2]).all() and (times[..., 0] >= 0.0).all()
 
 
 @settings(max_examples=30, deadline=None)

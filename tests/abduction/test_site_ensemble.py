@@ -32,13 +32,14 @@ from worldstate.ground.serialisation import decode, encode
 from worldstate.operations.training.site_references import learned_while_listening, with_site_references
 from worldstate.operations.training.training import TrainingSettings, train_model
 
+AZIMUTH = np.tile(np.linspace(-1, 1, 30), 2)
+SHAPE = {"front": AZIMUTH**2, "none": 0 * AZIMUTH, "left": -AZIMUTH, "right": AZIMUTH}
+
 
 def windows(rng, n=200, spread=0.8):
     """Return features of four overlapping classes at two sites of different level, with site references."""
     labels = rng.permutation(np.repeat(CLASSES, n // 4))
-    azimuth = np.tile(np.linspace(-1, 1, 30), 2)
-    shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
-    levels = np.stack([shape[label] for label in labels]) + spread * rng.normal(size=(n, 60))
+    levels = np.stack([SHAPE[label] for label in labels]) + spread * rng.normal(size=(n, 60))
     site = rng.integers(2, size=n)
     levels += 0.7 * site[:, None]
     references = np.stack([site_reference(levels[site == s]) for s in (0, 1)])[site]
@@ -260,14 +261,12 @@ def test_likelihoods_are_finite_far_from_the_training_data(trained):
 def made_up_table(seed):
     """Return features of 60 recordings at three sites; a step of three is a louder site."""
     rng = np.random.default_rng(seed)
-    azimuth = np.tile(np.linspace(-1, 1, 30), 2)
-    shape = {"front": azimuth**2, "none": 0 * azimuth, "left": -azimuth, "right": azimuth}
     labels = [
         (n, one)
         for n in range(60)
         for one in (("none",) if n % 2 else (("left", "right")[n // 6 % 2], "front"))
     ]
-    levels = [shape[one] + 0.7 * rng.normal(size=60) + 0.3 * (n % 3) for n, one in labels]
+    levels = [SHAPE[one] + 0.7 * rng.normal(size=60) + 0.3 * (n % 3) for n, one in labels]
     sites, recordings = ([f"SA{n % 3}" for n, _ in labels], [f"{seed} {n}" for n, _ in labels])
     return table([one for _, one in labels], sites, recordings, np.exp(levels))
 

@@ -150,14 +150,6 @@ def test_the_requested_alpha_and_the_promise_are_published_with_a_budget() -> No
         assert {cue.alpha for cue in world.state.cues} == {promise.alpha if stated else None}
 
 
-def test_without_a_camera_the_budget_is_unwatched() -> None:
-    told = budgets(false_alarms(camera=None, hops=200))
-    assert {one.verdict for one in told} == {"unwatched"}
-    assert {one.why for one in told} == {"no camera looks where vehicles come into view"}
-    assert told[-1] == told[0]
-    assert WorldFilter().state.budget is None
-
-
 def test_checkpoints_and_late_measurements_leave_the_budget_unchanged() -> None:
     measured = list(false_alarms(hops=400))
     here = budgets(measured)

@@ -100,14 +100,11 @@ def test_the_risk_of_any_side_is_the_sum_less_both(seed) -> None:
 
 @given(UNIT, UNIT, UNIT, UNIT)
 def test_messages_scale_the_other_hypotheses_alike(hidden, visible, one, other) -> None:
-    rest = 1.0 - hidden
-    before = SideBelief(
-        (hidden, 0.0), (0.0, 0.0), (hidden, 0.0), hidden, (hidden, rest * visible, rest * (1.0 - visible))
-    )
-    after = before.at_least((one, other)).hypotheses
-    assert sum(after) == pytest.approx(1.0) and after[0] == pytest.approx(
-        max(hidden, 1.0 - (1.0 - one) * (1.0 - other))
-    )
+    before = hidden, (1.0 - hidden) * visible, (1.0 - hidden) * (1.0 - visible)
+    quiet = SideBelief((hidden, 0.0), (0.0, 0.0), (hidden, 0.0), hidden, before)
+    after = quiet.at_least((one, other)).hypotheses
+    expected = max(hidden, 1.0 - (1.0 - one) * (1.0 - other))
+    assert sum(after) == pytest.approx(1.0) and after[0] == pytest.approx(expected)
     assert after[1] * (1.0 - visible) == pytest.approx(after[2] * visible)
 
 

@@ -217,8 +217,8 @@ def test_a_hidden_entity_stays_on_its_side_for_any_looming(rates, azimuth):
     assert all(0.2 < e.azimuth_rad < 1.7 and 0.17 < e.azimuth_std_rad < 0.8 for e in hidden)
 
 
-def test_the_same_run_has_the_same_ids():
-    ids = [[e.id for s in run(start(), approach_from_left())[1] for e in s.entities] for _ in range(2)]
-    assert ids[0] == ids[1]
-    other = run(start(settings=FilterSettings(stream="other")), approach_from_left())[1]
-    assert not set(ids[0]) & {e.id for s in other for e in s.entities}
+def test_the_same_stream_has_the_same_ids_and_another_one_others():
+    worlds = start(), start(), start(settings=FilterSettings(stream="other"))
+    states = [run(one, approach_from_left())[1] for one in worlds]
+    first, same, other = ([one.id for state in many for one in state.entities] for many in states)
+    assert first == same and not set(first) & set(other)

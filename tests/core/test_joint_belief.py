@@ -1,7 +1,7 @@
 """The joint belief of all sides against enumeration, and windows in it: eq. (6), overlap, memory."""
 
 import itertools
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -32,6 +32,7 @@ from worldstate.state import Priors, Rates, blind_corner
 STREET = StreetModel()
 ALONE = StreetModel(follows=1e-12)  # No vehicle follows directly behind another
 CERTAIN = replace(STREET, works=1.0)  # The camera works
+FIRST_STATE = 2 * FIRST_BIN  # A part without and with a visible vehicle
 
 
 def prior_of(rng: np.random.Generator, sides: int) -> StreetPrior:
@@ -95,10 +96,8 @@ def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
         own = np.moveaxis(by_hand, k, 0).reshape(PARTS, 2, -1)
         np.testing.assert_allclose(belief.hidden[k], own.sum(axis=(1, 2)), atol=1e-12)
         assert belief.emerged_from[k] == pytest.approx(own[:FIRST_BIN, 1].sum(), abs=1e-12)
-    assert belief.none_comes == pytest.approx(
-        by_hand.reshape(PARTS, 2, PARTS, 2, PARTS, 4)[:FIRST_BIN, :, :FIRST_BIN, :, :FIRST_BIN].sum(),
-        abs=1e-12,
-    )
+    nobody = by_hand[:FIRST_STATE, :FIRST_STATE, :FIRST_STATE].sum()
+    assert belief.none_comes == pytest.approx(nobody, abs=1e-12)
 
 
 @given(SEEDS, st.sampled_from([1, 2]))
@@ -265,14 +264,9 @@ def test_the_prior_of_rates_is_their_equilibrium(rates: tuple[float, ...], k: in
             [k * arrival, visible_arrival, -(k * arrival + visible_arrival)],
         ]
     )
-    settled = null_space(flow.T)[:, 0]
-    priors = Rates(*rates).priors(k)
-    np.testing.assert_allclose(
-        [priors.hidden, priors.visible, priors.none], settled / settled.sum(), atol=1e-9
-    )
-    assert street(k, rates=Rates(*rates)).belief.hypotheses == pytest.approx(
-        settled / settled.sum(), abs=1e-6
-    )
+    settled = null_space(flow.T)[:, 0] / null_space(flow.T).sum()
+    np.testing.assert_allclose(astuple(Rates(*rates).priors(k)), settled, atol=1e-9)
+    assert street(k, rates=Rates(*rates)).belief.hypotheses == pytest.approx(settled, abs=1e-6)
 
 
 def heard(stamp_ns, signature, source="acoustic", usable=True):
@@ -323,11 +317,8 @@ def test_only_the_new_part_of_a_window_counts(told):
 
 @given(signatures, signatures, st.integers(1, 10))
 def test_windows_of_another_modality_count_in_full(sound, radar, hops):
-    told = [
-        heard(10**9 + at * MEMORY_NS // 20, *one)
-        for at in range(hops)
-        for one in ((sound, "acoustic"), (radar, "radar"))
-    ]
+    stamps_ns = [10**9 + at * MEMORY_NS // 20 for at in range(hops)]
+    told = [one for ns in stamps_ns for one in (heard(ns, sound), heard(ns, radar, "radar"))]
     assert believed(told) == pytest.approx(by_hand([(sound, 1.0), (radar, 1.0)]), abs=1e-4)
 
 

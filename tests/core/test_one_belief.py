@@ -159,11 +159,9 @@ def test_a_vehicle_of_unknown_side_is_one_entity_with_shares() -> None:
     assert entity.direction == "left" and {cue.entity_id for cue in state.cues} == {entity.id}
     for one in entity.sides:
         assert one.azimuth_rad == pytest.approx(cue_of(state, one.direction).azimuth_rad)
-    left, right = entity.on_each_side()
+    left, right = parts = entity.on_each_side()
     assert left.id == entity.id != right.id and right.azimuth_rad < 0.0 < left.azimuth_rad
-    assert left.existence_probability + right.existence_probability == pytest.approx(
-        entity.existence_probability
-    )
+    assert sum(one.existence_probability for one in parts) == pytest.approx(entity.existence_probability)
     assert WorldState.from_json(state.to_json()) == state
 
 
@@ -199,10 +197,8 @@ def test_an_entity_of_unknown_side_is_handed_over_at_either_edge(edge_rad: float
 
 def test_a_masked_second_vehicle_keeps_its_existence() -> None:
     """Law 11: while the first vehicle masks the sound, no reading or look lowers the second."""
-    seen = [
-        replace(one, sequence=reading({"seen": 1.0})) for one in looks(TWO, 9, *np.arange(0.53, 0.15, -0.04))
-    ]
-    worlds = run(WorldFilter(), [*looks(TWO, 9), *seen[9:]])
+    before, seen = list(looks(TWO, 9)), list(looks(reading({"seen": 1.0}), 9, *np.arange(0.53, 0.15, -0.04)))
+    worlds = run(WorldFilter(), [*before, *seen[9:]])
     before, world = worlds[8].state, worlds[-1]
     right = {one.direction: one for one in before.entities}["right"]
     now = {one.id: one for one in world.state.entities if one.status == "hidden"}[right.id]
@@ -223,9 +219,8 @@ def test_the_advisory_ends_with_the_hand_over() -> None:
 
 def test_an_advisory_ends_without_measurements_and_with_any_hand_over() -> None:
     far, near = (both_sides((0.8, 0.15), (0.15, 0.8), bin_) for bin_ in ("coming_3s", "coming_0.5s"))
-    worlds = run(
-        WorldFilter(), (hop(number, sequence=far if number < 12 else near) for number in range(1, 20))
-    )
+    told = [hop(number, sequence=far if number < 12 else near) for number in range(1, 20)]
+    worlds = run(WorldFilter(), told)
     heard, silent = worlds[10], worlds[10].predict(1.5).state
     assert cue_of(heard.state, "left").advisory is not None and cue_of(silent, "left").risk > 0.3
     assert broken_laws(silent, heard.state) == []

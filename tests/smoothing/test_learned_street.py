@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from worldstate.core.filter import WorldFilter
 from worldstate.smoothing.learned_street import (
     DAY_S,
     LearnedEdge,
@@ -18,7 +17,7 @@ from worldstate.smoothing.learned_street import (
     watched,
     with_pass,
 )
-from worldstate.state.context import Context, Rates
+from worldstate.state.context import Context
 
 LEFT, RIGHT = math.radians(24.0), math.radians(-29.0)
 
@@ -85,9 +84,3 @@ def test_forgetting_reduces_weights_and_keeps_means():
         assert after.exposure_s == pytest.approx(before.exposure_s / math.e)
         assert after.edge.mean_rad == pytest.approx(before.edge.mean_rad, abs=math.radians(0.2))
         assert after.edge.std_rad > before.edge.std_rad
-
-
-def test_a_filter_keeps_a_learned_street_with_the_usual_rates_in_its_checkpoint():
-    world = WorldFilter(context_of(street_of(10))).predict(0.3)
-    assert world.context.rates == Rates()
-    assert WorldFilter.from_dict(world.to_dict()).context == world.context
