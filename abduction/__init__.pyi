@@ -4,6 +4,7 @@ from .co_evidence import Present as Present
 from .co_evidence import Unqueried as Unqueried
 from .cueing.cueing_policy import CueingPolicies as CueingPolicies
 from .cueing.cueing_policy import CueingPolicy as CueingPolicy
+from .cueing.cueing_policy import neyman_pearson_threshold as neyman_pearson_threshold
 from .cueing.cueing_policy import uncalibrated_policy as uncalibrated_policy
 from .cueing.risk_map import ReliabilityCurve as ReliabilityCurve
 from .cueing.risk_map import RiskMap as RiskMap
@@ -11,7 +12,6 @@ from .cueing.risk_map import brier_score as brier_score
 from .cueing.risk_map import expected_calibration_error as expected_calibration_error
 from .cueing.risk_map import fit_risk_map as fit_risk_map
 from .cueing.risk_map import reliability_curve as reliability_curve
-from .cueing.thresholds import neyman_pearson_threshold as neyman_pearson_threshold
 from .evidence import Posterior as Posterior
 from .evidence import SignatureEvidence as SignatureEvidence
 from .evidence import abduce as abduce

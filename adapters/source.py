@@ -38,8 +38,7 @@ from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.adapters.files.odometry_file import OdometryLog, read_odometry
 from worldstate.adapters.ros.bag_input import BagSound, is_bag, needed_array, read_beside, read_sound
 from worldstate.adapters.vehicle.car_file import CameraSetup, CarSensors, read_camera_setup, read_car
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.street_model import FilterSettings, StreetModel
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.frontend.settings import FrontEndSettings, default_band_hz, default_span_deg

@@ -14,7 +14,7 @@ from .adapters.camera.detections import DetectionFrame as DetectionFrame
 from .adapters.camera.pinhole import PinholeCamera as PinholeCamera
 from .adapters.listener import Listener as Listener
 from .adapters.source import ListenSettings as ListenSettings
-from .belief.settings import FilterSettings as FilterSettings
+from .belief.street_model import FilterSettings as FilterSettings
 from .core.filter import WorldFilter as WorldFilter
 from .frontend.array.microphone_array import MicrophoneArray as MicrophoneArray
 from .ground.errors import WorldstateError as WorldstateError

@@ -12,11 +12,11 @@ from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import (
     CueingPolicies,
     CueingPolicy,
+    neyman_pearson_threshold,
     sustained_alarm,
     sustained_statistic,
 )
 from worldstate.abduction.cueing.risk_map import PlattMap
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.evidence import SignatureEvidence, abduce, log_lambda, statistic, with_bearing_vote
 from worldstate.abduction.signature.window_classes import (
     CLASSES,

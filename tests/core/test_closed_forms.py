@@ -20,10 +20,9 @@ from worldstate.belief.hidden_bearing import hidden_motion, motion_in_view, time
 from worldstate.belief.joint_belief import joint_reading
 from worldstate.belief.kinematics.cartesian import CartesianBelief, arc
 from worldstate.belief.kinematics.motion import AZIMUTH_RATE, MotionBelief
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.street_model import FilterSettings, StreetModel
 from worldstate.belief.track import Tracks, born
 from worldstate.core.acoustic_update import acoustic_update, association_probability
 from worldstate.core.birth_death import hidden_on

@@ -18,8 +18,8 @@ from worldstate.belief.association import reached_edge
 from worldstate.belief.hidden_bearing import hidden_motion
 from worldstate.belief.kinematics.cartesian import EgoBelief, driven
 from worldstate.belief.kinematics.motion import MotionBelief
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SiteGeometry
+from worldstate.belief.street_model import FilterSettings
 from worldstate.belief.track import born
 from worldstate.core.site_model import FilterModel, from_here, site_geometry_of
 from worldstate.ground.errors import InputFileError

@@ -29,8 +29,7 @@ from worldstate.abduction.co_evidence import Absent, CoEvidence
 from worldstate.abduction.cueing.cueing_policy import uncalibrated_policy
 from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequencePosterior
 from worldstate.abduction.sequence.sequence_reader import TOO_FEW, SequenceReading
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.street_model import FilterSettings, StreetModel
 from worldstate.belief.track import Tracks, born
 from worldstate.commissioning.stream_exam import smoothed_log_odds
 from worldstate.core.memory import first_memory

@@ -13,7 +13,7 @@ from hop_tables import blank_stream
 
 from worldstate import Context, Listener, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent, MissRateTable, default_miss_rates, isotonic_grid
-from worldstate.abduction.cueing.cueing_policy import CueingPolicy
+from worldstate.abduction.cueing.cueing_policy import CueingPolicy, neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import (
     IsotonicMap,
     PlattMap,
@@ -21,7 +21,6 @@ from worldstate.abduction.cueing.risk_map import (
     expected_calibration_error,
     fit_isotonic,
 )
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.evidence import SideEvidence, abduce, statistic
 from worldstate.abduction.grounding import grounded_likelihood as grounding
 from worldstate.abduction.road_users import DomainGuard

@@ -127,7 +127,7 @@ def time_to_visible(
 
     Examples
     --------
-    >>> from worldstate.belief.settings import FilterSettings
+    >>> from worldstate.belief.street_model import FilterSettings
     >>> coming = CartesianBelief(np.array([10.0, 20.0, 0.0, -8.0]), np.diag([0.2, 0.2, 0.1, 0.1]))
     >>> left = SideGeometry("left", 0.56, 0.96, 0.35)
     >>> chance, times_s = time_to_visible(coming, left, SiteGeometry((left,), 0.6, FilterSettings()))

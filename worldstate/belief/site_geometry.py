@@ -12,8 +12,7 @@ from worldstate.belief.kinematics.motion import LEAST_STD, MotionBelief
 from worldstate.ground import FloatArray, replaced, wrap_angle
 from worldstate.measurement import CameraLook, Look, Sector
 
-from .settings import FilterSettings
-from .street_model import StreetModel
+from .street_model import FilterSettings, StreetModel
 
 
 def in_view(street: StreetModel) -> MotionBelief:

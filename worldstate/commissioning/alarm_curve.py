@@ -25,8 +25,7 @@ from worldstate.abduction.sequence.street_sides import StreetListener
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.acoustic import asked_again, beside_foreign
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.street_model import FilterSettings, StreetModel
 from worldstate.core.filter import WorldFilter
 from worldstate.frontend.spectra.sound_character import MEASURES
 from worldstate.ground.errors import InvalidArgumentError

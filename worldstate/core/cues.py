@@ -15,18 +15,20 @@ from worldstate.abduction.sequence.sequence_reader import TOO_FEW
 from worldstate.belief.hidden_bearing import announced, time_to_visible
 from worldstate.belief.kinematics.motion import AZIMUTH
 from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.street_model import StreetModel
 from worldstate.belief.track import Track
-from worldstate.ground import TINY, replaced
-from worldstate.measurement import Measurement
+from worldstate.ground import LEAST_HEARD, TINY, falling, replaced
+from worldstate.measurement import Heard, Measurement
 from worldstate.state import Advisory, Entity, EvidenceTerms, Held, Priors, RiskCue, SensorHealth
+from worldstate.state.sensor import MASKED
 
 from .birth_death import hidden_on
 from .memory import NEWS_HOLDS_NS, Instant, Memory, SourceState
-from .side_update import heard_beside
 from .site_model import FilterModel
 from .snapshot_builder import hidden_azimuth, sector, time_to_arrival
 from .street_belief import bounded_log_odds
 
+_JUST_LEFT_NS = 2 * NEWS_HOLDS_NS  # A vehicle that has left the view is as loud as before for this long
 _UNNAMED = "no source distinguishes this side: its risk is that of the prior"
 _Times: TypeAlias = tuple[dict[str, float] | None, tuple[float, float, float] | None]
 
@@ -38,6 +40,29 @@ class SideAdvisory:
     ends_ns: int
     held: bool = False  # The log-odds are below the threshold now
     announced: bool = False  # Raised by messages, not by sound
+
+
+def heard_beside(memory: Memory, measurement: Measurement, street: StreetModel) -> Heard:
+    r"""Return the audibility of hidden vehicles beside a vehicle that is in view or has just left it.
+
+    .. math:: s = 1 - P(\text{in view})\, \big(1 - P(\text{noticed} \mid \text{level})\big)
+
+    It is only published. The belief uses the sequence model, which was trained on vehicles that mask others.
+    """
+    heard, tracks = measurement.heard, memory.tracks
+    near = tracks.moving & (tracks.last_seen_ns >= measurement.stamp_ns - _JUST_LEFT_NS)
+    in_view = max(tracks.existence[near].tolist(), default=0.0)
+    if memory.belief.has_times:
+        in_view = max(in_view, memory.belief.joint.in_view)
+    # P(a vehicle that comes into view within three seconds adds at least 1 dB from 300 Hz to 2 kHz); without
+    # a vehicle in view it is 0.8 from 3 dB on.
+    quiet = falling(heard.excess_db, (street.excess_low_db, street.excess_high_db))
+    share = 1.0 - in_view * (1.0 - 0.5 * quiet)
+    # A vehicle that is probably not in view is no reason.
+    if in_view < 0.5 or share >= heard.share:
+        return heard
+    # The masking source itself is audible, so the share is not set below `LEAST_HEARD`.
+    return replaced(heard, share=max(share, LEAST_HEARD), reason=MASKED)
 
 
 def note_source(memory: Memory, measurement: Measurement, model: FilterModel) -> None:

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, uncalibrated_policy
 from worldstate.belief.detection import BY_ALL
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.side_belief import SideBelief
+from worldstate.belief.street_model import FilterSettings
 from worldstate.ground import InvalidArgumentError, NotUsable, in_range, integer_ns, nanoseconds, replaced
 from worldstate.ground.serialisation import ADDED, Layout, decode, encode
 from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan

@@ -6,8 +6,8 @@ from typing import Annotated, TypeVar
 from worldstate.abduction.co_evidence import CoEvidence, Unqueried
 from worldstate.abduction.road_users import DomainVerdict
 from worldstate.belief.kinematics.cartesian import EgoBelief, corrected
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.sound_tracks import SoundTrack
+from worldstate.belief.street_model import FilterSettings
 from worldstate.belief.track import Track, Tracks
 from worldstate.ground.serialisation import ADDED, Count, Probability, Via
 from worldstate.ground.values import SECONDS_PER_HOUR, NotUsable, nanoseconds

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.evidence import MOST_NATS
 from worldstate.belief.kinematics.cartesian import EgoBelief
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
+from worldstate.belief.street_model import FilterSettings
 from worldstate.ground.values import replaced
 from worldstate.measurement import Measurement
 from worldstate.state import Context

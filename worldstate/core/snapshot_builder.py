@@ -24,9 +24,9 @@ from worldstate.belief.kinematics.motion import (
     MotionBelief,
     white_acceleration,
 )
-from worldstate.belief.settings import FilterSettings
 from worldstate.belief.site_geometry import SideGeometry, SiteGeometry
 from worldstate.belief.sound_tracks import SoundTrack
+from worldstate.belief.street_model import FilterSettings
 from worldstate.belief.track import Track, Tracks, acceleration_psd, entity_id
 from worldstate.ground import seconds
 from worldstate.measurement.measurement import Heard

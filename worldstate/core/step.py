@@ -1,6 +1,6 @@
 """One step of the filter: predict the memory to a later time, and update it with a measurement."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from worldstate.belief.kinematics.cartesian import corrected, driven
 from worldstate.belief.sound_tracks import faded, followed
 from worldstate.belief.track import Tracks, predict_tracks, turn
 from worldstate.ground.values import NotUsable, seconds
-from worldstate.measurement import Measurement, Odometry, PositionScan
+from worldstate.measurement import CameraLook, Measurement, Odometry, PositionScan
 
 from .acoustic_update import acoustic_update
 from .birth_death import (
@@ -26,9 +26,8 @@ from .detection_update import new_looks, update_looks, update_positions
 from .fixed_lag import Timed
 from .memory import CountedLook, Memory
 from .relations import relations_at
-from .side_update import update_belief
 from .site_model import FilterModel, from_here, without_open_sides
-from .street_belief import carried
+from .street_belief import carried, informed
 
 # Two cameras and a radio find fewer at a crowded crossing; the time of a step grows with the square.
 MOST_TRACKS = 128
@@ -121,10 +120,21 @@ def _hear_and_look(memory: Memory, measurement: Measurement, start_ns: int, mode
         memory.sounds = followed(memory.sounds, measurement, new_s, site.street)
     update_looks(memory, measurement, looks, model)
     note_source(memory, measurement, model)
-    update_belief(memory, measurement, [seen for seen, _ in looks], model)
+    _update_belief(memory, measurement, [seen for seen, _ in looks], model)
     bearing = measurement.bearing
     memory.last.bearing = None if isinstance(bearing, NotUsable) else bearing
     memory.last.domain, memory.last.named = measurement.domain, measurement.signature.directions
+
+
+def _update_belief(
+    memory: Memory, measurement: Measurement, looks: Iterable[CameraLook], model: FilterModel
+) -> None:
+    """Update the belief over the sides with the evidence and the looks of a measurement."""
+    said, site, memory.last.predicted = measurement.sequence, model.site, memory.belief.joint.explanations
+    seen = map(site.in_sight, looks)
+    memory.belief = informed(memory.belief, measurement, seen, model.context, model.policy, site.settings)
+    if said is not None:  # Other sources leave it unchanged
+        memory.last.no_sequence = said if isinstance(said, NotUsable) else None
 
 
 def _take_odometry(memory: Memory, told: Odometry) -> None:

@@ -1,7 +1,7 @@
 """Belief over vehicles that come into view, from sound, looks and traffic, with an alarm."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
@@ -20,7 +20,6 @@ from worldstate.abduction.sequence.sequence_model import (
     SequenceAlarm,
 )
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
-from worldstate.belief.arrival_rate import ArrivalRate
 from worldstate.belief.joint_belief import (
     BINS,
     COMES,
@@ -32,9 +31,8 @@ from worldstate.belief.joint_belief import (
     usual_groups,
     window_likelihoods,
 )
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.side_belief import SideBelief
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.side_belief import ArrivalRate, SideBelief
+from worldstate.belief.street_model import FilterSettings, StreetModel
 from worldstate.ground import (
     CERTAIN_NATS,
     TINY,
@@ -327,7 +325,7 @@ def _expecting(kept: StreetBelief, context: Context, street: StreetModel) -> Str
 def informed(
     kept: StreetBelief,
     measurement: Measurement,
-    looks: Sequence[Look],
+    looks: Iterable[Look],
     context: Context,
     policy: CueingPolicy,
     settings: FilterSettings,

@@ -26,8 +26,7 @@ from worldstate.adapters.camera.box_linking import AzimuthBox, linked_boxes
 from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.joint_belief import BINS, DISTANT, FIRST_BIN, NONE
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.street_model import FilterSettings, StreetModel
 from worldstate.cli.common.output import CommandResult
 from worldstate.cli.common.progress import track
 from worldstate.commissioning.heard_stream import HeardStream

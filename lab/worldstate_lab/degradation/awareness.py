@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from worldstate.abduction.cueing.cueing_policy import sustained_alarm
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
+from worldstate.abduction.cueing.cueing_policy import neyman_pearson_threshold, sustained_alarm
 from worldstate.adapters.camera.camera_health import LEVELS
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, BoolArray, FloatArray, IndexArray

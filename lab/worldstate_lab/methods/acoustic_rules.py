@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from worldstate.abduction.cueing.cueing_policy import sustained_alarm
+from worldstate.abduction.cueing.cueing_policy import neyman_pearson_threshold, sustained_alarm
 from worldstate.abduction.cueing.risk_map import fit_isotonic
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.ground.typing import BoolArray, FloatArray, IntArray
 from worldstate.operations.metrics.approach_table import auroc, onset_outcome, rising_edges
 from worldstate.operations.recordings.hop_table import HopTable

@@ -19,8 +19,7 @@ from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import Model
 from worldstate.adapters.listener import learn_passes
 from worldstate.adapters.source import street_listener
-from worldstate.belief.settings import FilterSettings
-from worldstate.belief.street_model import StreetModel
+from worldstate.belief.street_model import FilterSettings, StreetModel
 from worldstate.commissioning.alarm_curve import measurements
 from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream, junction_named

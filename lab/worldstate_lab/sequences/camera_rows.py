@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
+from worldstate.abduction.cueing.cueing_policy import neyman_pearson_threshold
 from worldstate.adapters.acoustic import Grounding
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.ground.parallel import in_processes

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
+from worldstate.abduction.cueing.cueing_policy import neyman_pearson_threshold
 from worldstate.abduction.sequence.sequence_model import HORIZONS_S, SequencePosterior
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.file_io import read_json

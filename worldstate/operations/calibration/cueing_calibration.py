@@ -12,9 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy, sustained_statistic
+from worldstate.abduction.cueing.cueing_policy import (
+    CueingPolicies,
+    CueingPolicy,
+    neyman_pearson_threshold,
+    sustained_statistic,
+)
 from worldstate.abduction.cueing.risk_map import IsotonicMap, RiskMap, fit_risk_map
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.adapters.datasets.ovad import LOG_NAME, OvadDataset, Recording
 from worldstate.adapters.files.model_file import read_model
 from worldstate.adapters.listener import measure_steps

@@ -14,9 +14,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy
+from worldstate.abduction.cueing.cueing_policy import CueingPolicies, CueingPolicy, neyman_pearson_threshold
 from worldstate.abduction.cueing.risk_map import RiskMap, fit_platt
-from worldstate.abduction.cueing.thresholds import neyman_pearson_threshold
 from worldstate.abduction.signature.ensemble import EnsembleModel
 from worldstate.abduction.signature.ensemble_training import (
     MOVING_RECIPES,
