@@ -114,10 +114,6 @@ class ArrivalRate:
         kept = math.exp(-step_s / street.traffic_s)
         return ArrivalRate(self.count * kept, self.watched_s * kept + step_s)
 
-    def with_one_more(self) -> "ArrivalRate":
-        """Return the rate after one more arrival."""
-        return replaced(self, count=self.count + 1.0)
-
     def shift_nats(self, usual_hz: float, street: StreetModel) -> float:
         """Return the log-odds of an arrival minus the usual ones, in steps of 0.1 nats.
 

@@ -189,17 +189,18 @@ class StreetBelief:
         `kept` is the chance that it was another vehicle than the one believed there, by side. Vehicles on
         other sides stay if these sides are in `apart`, or if two vehicles were likelier than one.
         """
-        joint, two = self.joint, self.both_come > _TWO
+        joint, two, arrivals = self.joint, self.both_come > _TWO, list(self.arrivals)
         for k, residual in kept.items():
             is_apart = two or bool((set(kept) | set(apart)) - {k})
             joint = joint.emerged(k, residual, is_apart, street)
+            arrivals[k] = replaced(arrivals[k], count=arrivals[k].count + 1.0)
         return replaced(
             self,
             joint=joint,
             emerged_ns=tuple(stamp_ns if k in kept else ns for k, ns in enumerate(self.emerged_ns)),
             over_ns=tuple(None if k in kept else ns for k, ns in enumerate(self.over_ns)),
             decided=tuple(_LEAST_NATS if k in kept else one for k, one in enumerate(self.decided)),
-            arrivals=tuple(one.with_one_more() if k in kept else one for k, one in enumerate(self.arrivals)),
+            arrivals=tuple(arrivals),
         )
 
     def prior(self, street: StreetModel) -> StreetPrior:
