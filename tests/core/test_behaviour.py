@@ -83,7 +83,7 @@ def test_a_peak_moves_an_unlikely_entity_less():
 def test_an_approach_rate_updates_the_belief_by_data_association(step_s):
     r"""P = w P^+ + (1 - w) P^- + w (1 - w) K^2 nu^2, with w = P(the sound is this entity's) before it.
 
-    Only the new share of an overlapping window counts: R / share.
+    An overlapping window has the weight of its new share: R / share.
     """
     world = after(*(hop(at, LEFT, approach=Approach(0.3, 0.3)) for at in (10, 20)))
     (before,) = world.predict_to(round((2.0 + step_s) * 1e9)).state.entities

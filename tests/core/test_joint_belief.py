@@ -102,7 +102,7 @@ def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
 
 @given(SEEDS, st.sampled_from([1, 2]))
 def test_a_distant_vehicle_on_several_sides_counts_once(seed: int, sides: int) -> None:
-    """Counted per side, a distant vehicle made an existing one from nothing.
+    """As a sum over sides, a distant vehicle would become a near one.
 
     If no vehicle comes, the hypotheses are the groups of the reading.
     """
@@ -301,7 +301,7 @@ def by_hand(weighted):
 def test_only_the_new_part_of_a_window_counts(told):
     """Log-likelihoods are averaged over the memory.
 
-    A window without information or of unusable sound does not count.
+    A window without information, or of unusable sound, has no weight.
     """
     stamp_ns, since_ns, measurements, weighted = 10**9, None, [], []
     for signature, step_ns, usable in told:

@@ -72,7 +72,7 @@ def test_every_snapshot_obeys_the_laws(sequence: bool, seed: int) -> None:
 def test_an_alarm_does_not_depend_on_the_measurement_rate(seed: int) -> None:
     """Add empty messages, odometry, a source without evidence and a blind camera at and between hops.
 
-    The looks of that camera enter the mean that decides; the last one of each hop counts.
+    The looks of that camera enter the compared mean, which uses the last one of each hop.
     """
     rng = np.random.default_rng(seed)
     # A given prior is not changed by the observed traffic.
@@ -107,7 +107,7 @@ def test_a_denied_alarm_stays_denied_when_the_risk_rises_with_time() -> None:
 
 @pytest.mark.parametrize("nats", [7.0, 9.0])
 def test_the_window_alarm_does_not_depend_on_the_window_rate(nats: float) -> None:
-    """After two empty seconds a vehicle comes; only the new part of overlapping windows counts."""
+    """After two empty seconds a vehicle comes; an overlapping window has the weight of its new part."""
     empty, loud, onsets_s = (-nats, -nats, 0.0, 0.0), (nats, -nats, 0.0, 0.0), list[float]()
     for rate_hz in (5, 10, 20, 40, 100):
         world, number, named = WorldFilter(), 0, [False]

@@ -1,4 +1,4 @@
-"""Snapshots: what is written is read back, order carries no meaning, and damage is refused by name."""
+"""Snapshots: a written one is read back, order has no meaning, and errors of damage name the field."""
 
 import copy
 import html
@@ -125,18 +125,18 @@ states = built(
 
 
 @given(states)
-def test_what_is_written_is_read_back(state):
+def test_a_written_state_is_read_back(state):
     assert WorldState.from_json(state.to_json()) == state
     assert WorldState.from_dict(state.to_dict()) == state
 
 
 @given(states)
 @settings(max_examples=20)
-def test_what_is_written_holds_to_the_schema_that_ships(state):
+def test_a_written_state_obeys_the_shipped_schema(state):
     VALIDATOR.validate(json.loads(state.to_json()))
 
 
-def test_the_schema_that_ships_is_that_of_the_types():
+def test_the_shipped_schema_is_that_of_the_types():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     for name, kind in json_schema.SHIPPED.items():
         shipped = files("worldstate").joinpath(f"data/{name}.schema.json").read_text(encoding="utf-8")
@@ -145,7 +145,7 @@ def test_the_schema_that_ships_is_that_of_the_types():
 
 
 @given(states, st.randoms())
-def test_order_carries_no_meaning(state, random):
+def test_order_has_no_meaning(state, random):
     parts = {key: list(getattr(state, key)) for key in ("entities", "relations", "cues")}
     for part in parts.values():
         random.shuffle(part)
@@ -211,7 +211,7 @@ def test_sides_are_found_by_name_and_an_advisory_begins_in_one_state(state, begi
 
 
 class Table:
-    """Stands in for the only part of pandas that is used."""
+    """The only part of pandas that is used."""
 
     @staticmethod
     def DataFrame(rows, columns):  # noqa: N802
@@ -287,7 +287,7 @@ def test_damage_is_accepted_or_refused_by_a_typed_error(data):
         (("context", "rates", "arrival_hz"), -1.0, "arrival_hz: expected a number in"),
     ],
 )
-def test_damage_is_named(path, new, words):
+def test_errors_of_damage_name_the_field(path, new, words):
     damaged = replaced(full_state().to_dict(), path, new)
     with pytest.raises(InvalidArgumentError, match=words):
         WorldState.from_dict(damaged)
@@ -314,7 +314,7 @@ def test_another_major_version_is_refused_with_what_to_do(version, advice):
     assert not VALIDATOR.is_valid(value)
 
 
-def test_json_never_says_nan():
+def test_a_state_with_nan_is_not_written():
     entity = Entity("a", "hidden", 0.9, 0.8, math.nan, 0.3, 1, 2)
     with pytest.raises(InvalidArgumentError, match="finite"):
         WorldState(0, 0, (entity,)).to_json()
@@ -353,7 +353,7 @@ def test_a_cue_with_a_fault_is_not_usable_and_never_absent(world, expected):
     ("moving", "later_s", "masks"),
     [(True, 0.1, True), (True, 1.9, True), (True, 2.1, False), (False, 0.1, False), (False, 1.9, False)],
 )
-def test_what_moves_in_view_masks_until_two_seconds_after_it_was_seen(moving, later_s, masks):
+def test_a_vehicle_masks_until_two_seconds_after_it_was_in_view(moving, later_s, masks):
     seen = [replace(one, sequence=None, sightings=(replace(BOX, moving=moving),)) for one in IN_VIEW]
     dark = replace(QUIET, sequence=None, co_evidence=Unqueried("dark"), heard=LOUD)
     ages_ns = (round(age_s * 1e9) for age_s in (0.5 * later_s, later_s))
@@ -364,8 +364,8 @@ def test_what_moves_in_view_masks_until_two_seconds_after_it_was_seen(moving, la
 
 
 @given(st.dictionaries(name, unit, min_size=1), unit, unit)
-def test_what_would_be_heard_of_each_kind_falls_with_what_is_heard_and_is_null_of_nothing(kinds, one, other):
-    """Nothing in the way leaves the card's own shares; a deaf ear, or a card without shares, states none."""
+def test_the_audible_share_of_each_kind_falls_with_the_usable_share(kinds, one, other):
+    """It is at most the share on the model's card; without that share, or with unusable sound, it is None."""
 
     def stated(share: float) -> Mapping[str, float] | None:
         world = STREET.update(replace(QUIET, heard=Heard(share, "wind", kinds=kinds)))
@@ -383,7 +383,7 @@ def test_what_would_be_heard_of_each_kind_falls_with_what_is_heard_and_is_null_o
 
 
 @pytest.mark.parametrize("kinds", [{"car": 1.01}, {"car": math.nan}, {"car": "0.5"}, 0.5])
-def test_shares_of_kinds_that_are_none_are_refused(kinds):
+def test_wrong_shares_of_kinds_are_refused(kinds):
     with pytest.raises(InvalidArgumentError, match="kinds"):
         Heard(kinds=kinds)
 
@@ -392,7 +392,7 @@ def hears(*pairs: tuple[float, str | None]) -> tuple[Hearing, ...]:
     return tuple(Hearing(f"array {k}", share, 0, reason) for k, (share, reason) in enumerate(pairs))
 
 
-# What is wrong with a snapshot whose cues may be acted on, and the reason that follows from it.
+# Changes that make the cues of a usable snapshot unusable, by the reason that follows.
 FAULTS: dict[str, tuple[Callable[[WorldState], WorldState], ...]] = {
     "uncalibrated": (lambda one: replace(one, calibrated=False),),
     "masked": (
@@ -414,7 +414,7 @@ FAULTS: dict[str, tuple[Callable[[WorldState], WorldState], ...]] = {
 
 @given(states, st.sets(st.sampled_from(REASONS)), st.integers(0, 1))
 def test_a_cue_is_usable_unless_a_reason_applies_and_all_that_apply_are_given(state, wrong, variant):
-    # Nothing wrong, in every way in which nothing is: the budget may be in doubt, one of two arrays masked.
+    # Two usable snapshots: in the second one the budget is in doubt and one of two arrays is masked.
     fine = replace(
         state, calibrated=True, heard=hears((0.3, MASKED), (0.9, "wind")) if variant else None,
         domain=Familiar(-2.0) if variant else None, valid_until_ns=state.stamp_ns if variant else None,
@@ -422,11 +422,11 @@ def test_a_cue_is_usable_unless_a_reason_applies_and_all_that_apply_are_given(st
         budget=Budget("in doubt", None, {}, 25.0, Tally()) if variant else None,
     )  # fmt: skip
     told = judged(fine)
-    # A side that no source distinguishes has no evidence, and nothing vouches for its cue.
+    # A side that no source distinguishes has no evidence, so its cue is uncalibrated.
     alone = [() if cue.evidence else ("uncalibrated",) for cue in state.cues]
     assert told.calibrated and [cue.why_not for cue in told.cues] == alone
     faulty = replace(fine, valid_until_ns=fine.stamp_ns)
-    for reason, changes in FAULTS.items():  # What is unheard is not masked: it comes later here
+    for reason, changes in FAULTS.items():  # An unheard side is not masked, and its change comes later
         faulty = changes[variant % len(changes)](faulty) if reason in wrong else faulty
     told = judged(faulty)
     expected = tuple(one for one in REASONS if one in wrong - ({"masked"} if "unheard" in wrong else set()))

@@ -1,4 +1,4 @@
-"""Belief over all approach sides at one time, the source of all values per side, and the traffic there."""
+"""Belief over the approach sides at one time, the source of all values per side, and their arrivals."""
 
 import math
 from collections.abc import Sequence
