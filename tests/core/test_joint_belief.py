@@ -102,7 +102,7 @@ def test_three_sides_have_the_marginals_of_an_explicit_sum(seed: int) -> None:
 
 @given(SEEDS, st.sampled_from([1, 2]))
 def test_a_distant_vehicle_on_several_sides_counts_once(seed: int, sides: int) -> None:
-    """As a sum over sides, a distant vehicle would become a near one.
+    """A sum over the sides would contain a distant vehicle several times.
 
     If no vehicle comes, the hypotheses are the groups of the reading.
     """
