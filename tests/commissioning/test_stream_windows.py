@@ -1,27 +1,37 @@
-"""Windows of streams with known truth, and of sources in the open."""
+"""Windows of streams and of sources in the open; renderings for several arrays."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hop_tables import heard_stream
+from hypothesis import given
+from hypothesis import strategies as st
 
 from worldstate.abduction.signature.ensemble import SMALLEST_LEVEL
 from worldstate.abduction.signature.ensemble_training import SimulatedWindows
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES, side_ratios
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
+from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.model_file import read_model
 from worldstate.cli.main import main
+from worldstate.commissioning import commission
+from worldstate.commissioning.commission import windows_of_array
+from worldstate.commissioning.heard_stream import CommissionSettings, hear_stream, mountings
 from worldstate.commissioning.simulated_windows import (
     WEIGHT,
     OpenSource,
     hop_labels,
     open_feature,
-    open_field_features,
     open_field_windows,
     posteriors_along,
     stream_windows,
 )
 from worldstate.frontend.array.microphone_array import MicrophoneArray
+from worldstate.ground.errors import OutOfDomainError
+from worldstate.simulation import site
+from worldstate.simulation.stream.settings import StreamSettings
 
 TIME_S = np.round(np.arange(1.0, 60.0, 0.1), 1)
 
@@ -78,14 +88,13 @@ def test_a_bicycle_gives_neither_hidden_nor_empty_windows():
 
 def test_classes_have_the_weights_of_the_released_windows():
     rng = np.random.default_rng(1)
-    parts = [stream(("light", "left", 30.0), site=site, rng=rng) for site in ("SA1", "SB1")]
+    parts = [stream(("light", "left", 30.0), site=name, rng=rng) for name in ("SA1", "SB1")]
     found = stream_windows(parts)
     hidden = np.isin(found.y, ("left", "right", "both"))
     mass = {name: found.weights[found.y == name].sum() for name in ("front", "none")}
     assert mass == pytest.approx(dict.fromkeys(mass, found.weights[hidden].sum()))
     assert (found.weights[hidden] == WEIGHT).all()
-    alone = stream_windows(parts[:1])
-    np.testing.assert_array_equal(found.at(["SA1"]).X, alone.X)
+    np.testing.assert_array_equal(found.at(["SA1"]).X, stream_windows(parts[:1]).X)
     # Separated by site: an open field belongs to none and is always present.
     everything = SimulatedWindows.joined([found, open_field_windows(np.ones((3, 60)))])
     assert len(everything.at(["SB1"]).y) == (found.sites == "SB1").sum() + 3
@@ -94,8 +103,8 @@ def test_classes_have_the_weights_of_the_released_windows():
 
 def test_posteriors_of_a_stream_equal_those_of_the_running_model():
     model, features = read_model().signature, np.random.default_rng(2).uniform(SMALLEST_LEVEL, 1.0, (8, 60))
-    site = SiteSignature(model)
-    by_hop = [site.evidence(feature).sides.log_ratios for feature in features]
+    running = SiteSignature(model)
+    by_hop = [running.evidence(feature).sides.log_ratios for feature in features]
     found = side_ratios(posteriors_along(model, features), model.classes, model.class_prior)
     np.testing.assert_allclose(found, by_hop, atol=1e-9)
 
@@ -130,13 +139,52 @@ def test_the_feature_of_a_source_in_the_open_peaks_at_its_azimuth(azimuth_deg):
     early, late = open_feature(RING, loud, rng).reshape(2, 30)
     # Azimuths of the feature increase to the right.
     there = np.linspace(-90.0, 90.0, 30)
-    assert there[early.argmax()] == pytest.approx(-azimuth_deg, abs=8.0)
-    assert there[late.argmax()] == pytest.approx(-azimuth_deg, abs=8.0)
+    for half in (early, late):
+        assert there[half.argmax()] == pytest.approx(-azimuth_deg, abs=8.0)
     lost = open_feature(RING, OpenSource(loud.azimuth_rad, 12.0, (0.0, 0.0), -30.0), rng)
     assert np.ptp(lost) < 0.5 * np.ptp(early)
 
 
-def test_windows_in_the_open_are_reproducible():
-    first, again = (open_field_features(RING, 3, np.random.default_rng(4)) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    assert len(np.unique(first, axis=0)) == 3
+ARRAY = MicrophoneArray([[0.1, 0.2, 0.0], [0.0, 0.05, 0.1], [0.0, -0.1, 0.0], [-0.1, -0.25, 0.2]])
+
+
+@given(st.floats(-np.pi, np.pi))
+def test_a_turned_array_turns_the_bearing(azimuth_rad: float) -> None:
+    _, turned, _ = mountings(ARRAY, np.random.default_rng(1)).values()
+    np.testing.assert_allclose(
+        turned.delays_s(azimuth_rad + np.radians(2.0)), ARRAY.delays_s(azimuth_rad), atol=1e-12
+    )
+
+
+def test_one_rendering_serves_all_arrays() -> None:
+    settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
+    mounted = list(mountings(ARRAY, np.random.default_rng(1)).values())
+    right, turned, _ = hear_stream(settings, [ARRAY], [mounted])
+    (alone,) = hear_stream(settings, [ARRAY])
+    for name, column in alone.hops.columns.items():
+        np.testing.assert_array_equal(right.hops.columns[name], column, err_msg=name)
+    assert not np.array_equal(turned.hops.feature, right.hops.feature)
+
+
+def test_renderings_are_reused_for_other_arrays(tmp_path, monkeypatch) -> None:
+    """A second array needs no new rendering and has the sound it has alone."""
+    settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
+    board = MicrophoneArray(ARRAY.positions_m[:3] * [1.0, 0.5, 1.0])
+    (expected,) = hear_stream(settings, [board])
+    list(commission.heard_streams([settings], ARRAY, tmp_path, beside=[board]))
+    monkeypatch.delattr(commission, "hear_stream")
+    (kept,) = commission.heard_streams([settings], board, tmp_path)
+    np.testing.assert_allclose(kept.hops.feature, expected.hops.feature, atol=1e-5)
+    np.testing.assert_array_equal(kept.hops.time_s, expected.hops.time_s)
+
+
+def test_tables_of_another_array_raise_an_error() -> None:
+    names, here = np.array(["SA1", "SB1", "SB2"]), domain_of(ARRAY, [6000.0], ["SA101"])
+    table = FeatureTable(np.ones((3, 60)), np.array(["left"] * 3), names, names, names, (None,) * 3)
+    kept = windows_of_array(table, CommissionSettings(leave_out=("SB1",)), here)
+    assert kept.environments.tolist() == ["SA1", "SB2"]
+    # Without it a commissioned model would have no budget and no times.
+    assert kept.domain is here
+    elsewhere = domain_of(MicrophoneArray(ARRAY.positions_m * [1.0, 1.1, 1.0]), [6000.0], ["SA1"])
+    with pytest.raises(OutOfDomainError, match="not the array"):
+        windows_of_array(replace(table, domain=elsewhere), CommissionSettings(), here)
