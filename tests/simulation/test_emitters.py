@@ -58,8 +58,7 @@ def envelope(x, fs=FS, rate=100):
 @pytest.mark.long
 @pytest.mark.parametrize("name", SYNTHESES)
 def test_every_sound_has_the_level_of_the_table(sounds, name):
-    heard = sosfilt(a_weighting_filter(FS), sounds[name].astype(float))
-    power = envelope(heard, rate=8) ** 2
+    power = envelope(sosfilt(a_weighting_filter(FS), sounds[name].astype(float)), rate=8) ** 2
     level = 10 * np.log10(power[power > power.max() / 10].mean() / 20e-6**2)
     # The delay of the filter moves a blast from one eighth of a second into two.
     assert level == pytest.approx(SOUNDS[name].level_db, abs=1.5 if name == "shots" else 1.0)
@@ -242,14 +241,6 @@ def test_short_recordings_are_repeated_and_pauses_kept(tmp_path):
     assert np.median(levels) < 1e-2 * (REFERENCE_PA * 10.0 ** (SOUNDS["dog"].level_db / 20.0)) ** 2
 
 
-def test_a_kind_without_recordings_is_synthesised(tmp_path):
-    folder = folder_of(tmp_path, "dog", band_noise(2.0, 16_000), 16_000)
-    with_folder, without = (
-        emitted(SOUNDS["horn"], 8_000, 8_000.0, np.random.default_rng(3), one) for one in (folder, "")
-    )
-    assert with_folder.tobytes() == without.tobytes()
-
-
 def test_a_recorded_sound_propagates_through_the_street(tmp_path):
     """Its line is 20 dB above the street, delayed by the path to each microphone."""
     folder = folder_of(tmp_path, "tone", band_noise(4.0, 16_000), 16_000)
@@ -259,13 +250,11 @@ def test_a_recorded_sound_propagates_through_the_street(tmp_path):
         preset=replace(preset(), sounds_folder=folder),
         sounds=(SoundSettings("tone", 0.0, 2.0, (4.0, 0.0)),),
     )
-    for microphone in range(2):
-        quiet, loud = (
-            simulate_recording(one, np.random.default_rng(4), PAIR).audio[:, microphone]
-            for one in (street, sounding)
-        )
-        assert band_power(loud, 6e3, 950.0, 1050.0) > 100.0 * band_power(quiet, 6e3, 950.0, 1050.0)
-        assert band_power(loud, 6e3, 2000.0, 2500.0) < 2.0 * band_power(quiet, 6e3, 2000.0, 2500.0)
+    quiet, loud = (
+        simulate_recording(one, np.random.default_rng(4), PAIR).audio.T for one in (street, sounding)
+    )
+    assert band_power(loud, 6e3, 950.0, 1050.0) > 100.0 * band_power(quiet, 6e3, 950.0, 1050.0)
+    assert band_power(loud, 6e3, 2000.0, 2500.0) < 2.0 * band_power(quiet, 6e3, 2000.0, 2500.0)
 
 
 def test_folders_of_recordings_have_the_names_of_kinds(tmp_path):
@@ -307,23 +296,13 @@ RATE_HZ, PASS_S = 6000.0, 5.0
 STREET = StreamSettings(junction_named("SA1"), 1.0)
 
 
-def levels_db(sound: np.ndarray) -> np.ndarray:
-    half = round(0.5 * RATE_HZ)
-    return np.asarray(
-        10.0 * np.log10(np.square(sound[: len(sound) // half * half]).reshape(-1, half).mean(axis=1))
-    )
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["light", "heavy", "tram"])
 def test_a_passing_vehicle_swells_and_an_idling_one_does_not(kind: str) -> None:
-    drawn = [
-        (
-            np.ptp(levels_db(close_vehicle(KINDS[kind], STREET.preset, STREET.site, PASS_S, RATE_HZ, one))),
-            np.ptp(levels_db(idling_vehicle(KINDS[kind], STREET.preset, STREET.site, PASS_S, RATE_HZ, one))),
-        )
-        for one in np.random.default_rng(1).spawn(6)
-    ]
+    of_street, drawn = (KINDS[kind], STREET.preset, STREET.site, PASS_S, RATE_HZ), []
+    for rng in np.random.default_rng(1).spawn(6):
+        sounds = close_vehicle(*of_street, rng), idling_vehicle(*of_street, rng)
+        drawn.append([np.ptp(20.0 * np.log10(envelope(sound, RATE_HZ, rate=2))) for sound in sounds])
     passes, idles = np.median(drawn, axis=0)
     # A tram is 30 m long, so it is beside the recorder for two seconds.
     assert passes > idles + (1.0 if kind == "tram" else 4.0)

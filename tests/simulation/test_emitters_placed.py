@@ -27,7 +27,6 @@ from worldstate.simulation import (
     SimulationSettings,
     SoundSettings,
     draw_settings,
-    preset,
     simulate_recording,
     site,
 )
@@ -35,7 +34,6 @@ from worldstate.simulation.emitters.emitter import emitted
 from worldstate.simulation.emitters.placed_sound import add_signal, add_sound, directivity
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.octave_bands import split_octaves
-from worldstate.simulation.scene.presets import site_ambience
 from worldstate.simulation.scene.settings import SIGNALS, sound_kind, with_sounds
 from worldstate.simulation.scene.vehicle import drive
 from worldstate.simulation.sound.delay import KNOT_SAMPLES
@@ -160,16 +158,6 @@ def test_wind_levels_are_equal_and_incoherent_at_all_microphones(over_db, lasts_
     high = (frequencies >= 600.0) & (frequencies <= 1000.0)
     fallen_db = 10.0 * np.log10(density[:, octave].mean() / density[:, high].mean())
     assert fallen_db == pytest.approx(37.0 * np.log10(780.0 / 98.0), abs=4.0)
-
-
-@given(st.integers(0, 2**31), st.sampled_from(SITES), st.floats(-15.0, 5.0))
-def test_wind_swells_by_8_to_25_db_for_1_to_5_s(seed, where, level):
-    windy = replace(preset(), wind_100hz_db=preset().wind_100hz_db + level)
-    empty = SimulationSettings(site(where), "none", duration_s=10.0, preset=windy)
-    (wind,) = with_sounds(empty, ["wind"], 4, np.random.default_rng(seed)).sounds
-    mean_db = windy.wind_100hz_db + site_ambience(site(where), windy).wind_db
-    assert 8.0 <= sound_kind("wind").level_db + wind.level_offset_db - mean_db <= 25.0
-    assert 1.0 <= wind.duration_s <= 5.0
 
 
 def test_a_signal_of_a_vehicle_moves_with_it():

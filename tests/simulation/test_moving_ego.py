@@ -13,9 +13,7 @@ from simulated_sound import (
     OPEN,
     PAIR,
     C,
-    at,
     band_power,
-    carried,
     error_db,
     noise,
     rendered,
@@ -41,7 +39,7 @@ from worldstate.simulation import (
     simulate_recording,
 )
 from worldstate.simulation.scene.driving import trajectories
-from worldstate.simulation.scene.junction import SITES, Site, drawn_site, ego_moves, renderer_named, site
+from worldstate.simulation.scene.junction import Site, drawn_site, site
 from worldstate.simulation.scene.kinds import LIGHT
 from worldstate.simulation.scene.vehicle import EgoMotion
 from worldstate.simulation.sound import ego_sound, scatter
@@ -215,13 +213,6 @@ def leaps(audio: np.ndarray) -> float:
     return float(max((block / np.median(block, axis=0)).max() for block in blocks))
 
 
-def test_a_click_would_be_seen():
-    sound = np.random.default_rng(1).standard_normal((8000, 2))
-    assert leaps(sound) < 9.0
-    sound[4000:] += 25.0
-    assert leaps(sound) > 12.0
-
-
 RATE_HZ = 3000.0
 HALF_IMAGE_RAD = 0.597
 
@@ -286,17 +277,6 @@ def test_sources_removed_from_a_drive_are_inaudible() -> None:
     assert abs(levels[0].mean() - levels[1].mean()) < 0.5
 
 
-def test_own_noise_ends_when_the_ego_stops() -> None:
-    drawn = drive(4, "empty", 0.25)
-    assert drawn.ego.speed_mps > 3.0 and drawn.ego.stop_s < 9.0
-    heard = np.concatenate([block.pressure_pa for block in draw_stream(drawn, PAIR).blocks()], axis=1)
-    assert heard.shape == (2, drawn.samples)
-    seconds = heard[0].reshape(15, 3000).std(axis=1)
-    assert seconds[1:7].min() > 1.4 * seconds[10:].max()
-    again = [block.pressure_pa for block in draw_stream(drawn, PAIR).blocks()]
-    np.testing.assert_array_equal(np.concatenate(again, axis=1), heard)
-
-
 @pytest.mark.parametrize("name", ["DB101", "DTA101", "DMA101"])
 def test_strong_own_wind_is_reported_as_wind(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every hop of a drive is usable as simulated, none with 20 dB more of its own wind."""
@@ -310,18 +290,6 @@ def test_strong_own_wind_is_reported_as_wind(name: str, monkeypatch: pytest.Monk
         frames = [frame for block in stream.blocks() for frame in front_end.process(stream.recorded(block))]
         usable.append([heard_of(frame).usable for frame in frames])
     assert len(usable[0]) > 30 and all(usable[0]) and not any(usable[1])
-
-
-@given(
-    st.builds("{}{}{}".format, st.sampled_from("STM"), st.sampled_from("AB"), st.integers(1, 999))
-    | st.sampled_from(SITES)
-)
-def test_a_drive_is_at_the_place_of_its_renderer(standing: str) -> None:
-    moving = f"D{standing.removeprefix('S')}"
-    for plan in (drawn_site, site) if standing in (*SITES, "TA1", "MB203") else (drawn_site,):
-        assert replace(plan(moving), name=standing) == plan(standing)
-    assert renderer_named(moving) == renderer_named(standing)
-    assert ego_moves(moving) and not ego_moves(standing)
 
 
 # A place takes a second with the second renderer and some hundredths with the third.
@@ -408,12 +376,3 @@ def test_the_weights_of_places_sum_to_one(heard_x: list[float], step_m: float) -
         mean[span] += share * place_m
     np.testing.assert_allclose(total, 1.0)
     np.testing.assert_allclose(mean, x, atol=1e-9)
-
-
-def test_a_moving_ego_has_the_waveform_of_its_changing_distance():
-    """The tone of a static source with its delay, level and Doppler shift."""
-    street = street_of(OPEN, ONE, 2.0, FS, EgoMotion(8.0, 10.0))
-    (found,) = carried(street, source_in(street, tone(1000.0), at(20.0, 3.0)))
-    time = np.arange(len(found)) / FS
-    distance = np.sqrt((20.0 - street.receiver.ego.x_m(time)) ** 2 + 3.0**2 + 1.4**2)
-    assert error_db(found, tone(1000.0)(time - distance / C) / distance) < -60.0

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulated_sound import PAIR, street_of
+from simulated_sound import street_of
 
-from worldstate.simulation.dataset.recording import simulate_recording
-from worldstate.simulation.scene.junction import drawn_site, site
+from worldstate.simulation.scene.junction import drawn_site
 from worldstate.simulation.scene.presets import preset
-from worldstate.simulation.scene.settings import SimulationSettings
-from worldstate.simulation.sound import mirrors, rays, renderers
+from worldstate.simulation.sound import mirrors, rays
 from worldstate.simulation.sound.delay import Emission
 from worldstate.simulation.sound.mirrors import FADE_M, Fronts, add_mirrored, drawn_fronts, trace
-from worldstate.simulation.sound.rays import Houses, _at, azimuths_rad, corner_gain, reached
+from worldstate.simulation.sound.rays import Houses, _at, azimuths_rad, reached
 from worldstate.simulation.sound.static_field import PlacedSource
 
 FS = 6000.0
@@ -151,15 +149,6 @@ def test_the_opposite_wall_reflects_a_hidden_vehicle() -> None:
     assert min(louder) > 0.0 and np.median(louder) > 3.0, np.round(louder, 1)
 
 
-@pytest.mark.parametrize("name", ["TA1", "MB1"])
-def test_ambience_and_vehicles_use_one_renderer(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    towns = []
-    monkeypatch.setattr(renderers, "add_town", lambda *arguments: towns.append(arguments[-1]))
-    settings = SimulationSettings(site(name), "none", duration_s=0.6, entry_s=0.45)
-    simulate_recording(settings, np.random.default_rng(1), PAIR)
-    assert len(towns) == 1 and towns[0].opened.sum() > 0.0
-
-
 def silent_at(x_m: float, y_m: np.ndarray) -> PlacedSource:
     time_s = np.arange(len(y_m)) * 0.02
     return PlacedSource(Emission.of(np.zeros(128, np.float32), 0.0, FS), time_s, 0.0 * y_m + x_m, y_m, 0.3)
@@ -183,16 +172,6 @@ def test_the_level_is_continuous_at_the_edge_of_the_shadow(plan, side) -> None:
     assert np.abs(np.diff(level_db)).max() < 3.0  # in 0.1 m; a hard edge would lose all of it
     assert level_db[40] == pytest.approx(-6.0, abs=1.0)
     assert level_db[0] < -9.0 and abs(level_db[-1]) < 1.0
-
-
-def test_absorbing_walls_leave_direct_and_diffracted_sound() -> None:
-    plan = drawn_site("MA7")
-    fronts = drawn_fronts(plan)
-    y = np.linspace(-25.0, 25.0, 201)
-    with built(Fronts(fronts.ends_m, 0.0 * fronts.kept)):
-        ways = mirrors.ways_of(plan, silent_at(plan.lanes_m[0], y), np.array([0.0, 0.0, 1.7]))
-    audible = [way for way in ways if way.gain.any()]
-    assert len(ways) > 6 and len(audible) == 3  # straight, round the left corner, round the right one
 
 
 ROOM_M, HEIGHT_M, EAR_M = (30.0, 20.0), 6.0, 1.6
@@ -232,17 +211,6 @@ def test_specular_rays_equal_image_sources() -> None:
         seen = (gain[late] * wave).sum() / expected
         traced = (directions * np.exp(1j * azimuths_rad())).sum() / directions.sum()
         assert abs(traced - seen) < 0.1
-
-
-def test_diffraction_is_6_db_at_the_edge_of_the_shadow() -> None:
-    """At high octaves 6 dB at the boundary, more deeper in the shadow and at higher frequencies."""
-    ahead, beside = 5.0, 3.0
-    x = np.full(3, 9.0)
-    y = beside * 9.0 / ahead + np.array([0.0, 3.0, 12.0])
-    gain = corner_gain((ahead, beside), x, y) * np.hypot(x, y)[:, None]
-    np.testing.assert_allclose(20.0 * np.log10(gain[0, 5:]), -6.02, atol=0.7)
-    assert (np.diff(gain, axis=0) < 0.0).all() and (np.diff(gain[1:], axis=1) < 0.0).all()
-    np.testing.assert_allclose(corner_gain((ahead, -beside), x, -y), corner_gain((ahead, beside), x, y))
 
 
 def test_rough_walls_scatter_without_loss() -> None:

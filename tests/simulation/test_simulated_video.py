@@ -19,18 +19,15 @@ from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
 from worldstate.simulation import (
     SITES,
-    DatasetSettings,
     SimulationSettings,
     simulate_recording,
     site,
-    write_dataset,
     write_recording,
 )
+from worldstate.simulation.camera.simulated_detector import park
 from worldstate.simulation.camera.street_view import (
     ROAD_Z_M,
-    Panel,
     View,
-    cast_panels,
     cast_solid,
     paint_street,
 )
@@ -40,7 +37,6 @@ from worldstate.simulation.scene.vehicle import HEIGHT_M, LENGTH_M, WIDTH_M
 
 SMALL = PinholeCamera.ovad(width_px=320, height_px=201)
 MIDDLE = PinholeCamera.ovad(width_px=640, height_px=402)
-RED, BLACK = (180.0, 20.0, 20.0), np.zeros((16, 16, 3), np.uint8)
 
 
 def scene(name="SA1", approach="left", **changes):
@@ -102,26 +98,12 @@ def test_intersections_equal_those_by_sampling(seed):
     assert np.abs((met * normals[face[both]]).sum(axis=1) - offsets[face[both]]).max(initial=0.0) < 1e-4
 
 
-def test_nearer_panels_hide_farther_ones_in_any_order():
-    view = View(PinholeCamera.ovad(width_px=8, height_px=6, pitch_rad=0.0))
-
-    def plain(colour):
-        return lambda a, b: np.full((*a.shape, 3), colour, np.float32)
-
-    near = Panel(0, 3.0, ((-9.0, 9.0), (-9.0, 9.0)), plain(10.0))
-    far = Panel(0, 5.0, ((-9.0, 9.0), (-9.0, 9.0)), plain(20.0))
-    for order in ([near, far], [far, near]):
-        image, depth = cast_panels(view, view.whole, order, plain(99.0))
-        assert (image == 10.0).all()
-        assert depth == pytest.approx(3.567, abs=1e-3)
-
-
 def test_a_car_fills_the_projection_of_its_cuboid():
     """The bounding box of its colour in the open against the projected corners by OpenCV."""
     street = paint_street(site("SB1"), View(MIDDLE))
     still = street.pixels()
     image = still.copy()
-    car = Car(8.0, 2.2, 1, RED)
+    car = Car(8.0, 2.2, 1, (180.0, 20.0, 20.0))
     add_car(street, car, image)
     # Paint and lamps without the shadow: red, or brighter than the road can be.
     body = (np.abs(image - still).max(axis=2) > 30.0) & (image.max(axis=2) > image.min(axis=2) + 60.0)
@@ -145,11 +127,10 @@ def test_images_change_only_from_line_of_sight(name, approach):
     plan = scene(name, approach, duration_s=3.0)
     recording, frames = filmed(plan)
     t0 = recording.t0_frame
-    before = [changed(frame, frames[0]).mean() for frame in frames[: t0 - 2]]
-    assert max(before) < 1e-4
-    first_second = [changed(frame, frames[0]).mean() for frame in frames[t0 + 1 : t0 + 10]]
-    assert max(first_second) > 0.02
-    assert changed(frames[t0 + 1], frames[0]).mean() > 2e-4
+    differ = [changed(frame, frames[0]).mean() for frame in frames]
+    assert max(differ[: t0 - 2]) < 1e-4
+    assert max(differ[t0 + 1 : t0 + 10]) > 0.02
+    assert differ[t0 + 1] > 2e-4
     columns = np.flatnonzero(changed(frames[t0 + 2], frames[0]).any(axis=0))
     assert (columns.mean() < 160) == (approach == "left")
 
@@ -157,11 +138,9 @@ def test_images_change_only_from_line_of_sight(name, approach):
 def test_images_of_an_empty_street_differ_only_by_noise_of_the_seed():
     plan = scene(approach="none", duration_s=0.6)
     (recording, frames), (_, other) = (filmed(plan, seed) for seed in (3, 4))
-    assert not recording.truth["frames"]
+    assert (recording.truth["frames"], recording.t0_frame) == ([], 4)  # OVAD's 70 % of the length
     difference = frames[0].astype(float) - frames[5]
-    assert 1.5 < difference.std() / np.sqrt(2) < 1.9 or difference.std() == pytest.approx(
-        1.5 * 2**0.5, rel=0.2
-    )
+    assert 1.5 < difference.std() / np.sqrt(2) < 1.9
     assert frames[0].mean() == pytest.approx(np.mean([frame.mean() for frame in frames]), abs=0.1)
     assert not np.array_equal(frames[0], frames[1])
     assert not np.array_equal(frames[0], other[0])
@@ -170,10 +149,7 @@ def test_images_of_an_empty_street_differ_only_by_noise_of_the_seed():
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(SITES))
 def test_the_position_of_the_parked_car_follows_from_its_boxes(seed, name):
-    from worldstate.simulation.camera.simulated_detector import park
-
-    rng = np.random.default_rng(seed)
-    plan = site(name)
+    plan, rng = site(name), np.random.default_rng(seed)
     right, left = plan.sight_m(parked_lane_m(plan), PinholeCamera.ovad().position_m[:2])
     middle = np.random.default_rng(seed).uniform(0.6 * right, 0.6 * left)
     found = parked_middle_m(park(plan, 20, rng), plan)
@@ -204,41 +180,36 @@ def passing():
     return filmed(scene("SB2", "right", duration_s=2.0, entry_s=1.0), camera=PinholeCamera.ovad())
 
 
-def missed(frames, recording, camera, family, d, seed=0):
-    """Return the share of frames with a box in which a fresh motion detector has IoU below 0.3."""
-    detector, rng, looks, misses = MotionDetector(), np.random.default_rng(seed), 0, 0
+def missed(recording, frames, family, d):
+    """Return the share of boxes with which a fresh motion detector has IoU below 0.3."""
+    detector, rng, misses = MotionDetector(), np.random.default_rng(0), []
     for number, frame in enumerate(frames):
         found = detector.detect(degrade(frame, family, d, rng))
         if number >= max(recording.t0_frame, 10):
             for seen in recording.detections[number]:
-                box = np.array([seen.box_px]) * camera.width_px / 1936
-                looks += 1
-                misses += not (overlaps(box, found.boxes_px) >= 0.3).any()
-    return misses / looks
+                misses.append(not (overlaps(np.array([seen.box_px]), found.boxes_px) >= 0.3).any())
+    return np.mean(misses)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("family", ["blur", "darkness", "noise"])
 def test_a_motion_detector_loses_the_vehicle_in_degraded_frames_alone(family, passing):
     """Levels and blur in pixels are those of the full image size."""
-    recording, frames = passing
-    rates = [missed(frames, recording, PinholeCamera.ovad(), family, d) for d in (0.0, 0.25, 1.0)]
+    rates = [missed(*passing, family, d) for d in (0.0, 0.25, 1.0)]
     assert rates[0] <= 0.1
     assert rates[1] <= 0.2
     assert rates[2] >= 0.9
 
 
-def test_video_without_frames_or_folder_raises_an_error(tmp_path):
+def test_video_without_frames_folder_or_opencv_raises_an_error(tmp_path, monkeypatch):
     with pytest.raises(InvalidArgumentError, match="frames"):
         write_video(tmp_path / "v.mp4", [])
+    image = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(InputFileError, match="nowhere"):
-        write_video(tmp_path / "nowhere" / "v.mp4", [BLACK])
-
-
-def test_without_opencv_the_extra_is_named(tmp_path, monkeypatch):
+        write_video(tmp_path / "nowhere" / "v.mp4", [image])
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"worldstate\[vision\]"):
-        write_video(tmp_path / "v.mp4", [BLACK])
+        write_video(tmp_path / "v.mp4", [image])
 
 
 def test_the_video_is_written_beside_the_sound_reproducibly(tmp_path):
@@ -257,16 +228,3 @@ def test_the_video_is_written_beside_the_sound_reproducibly(tmp_path):
     assert (video.width_px, video.height_px, video.frame_rate_hz, len(back)) == (640, 402, 10.0, 5)
     assert np.abs(back[3].astype(float) - drawn[3]).mean() < 4.0
     assert len(read_detections(first / "camera_baseline_results.json")) == 5
-
-
-@pytest.mark.slow
-def test_sound_beside_video_does_not_depend_on_the_number_of_jobs(tmp_path):
-    for name, video, jobs in (("a", True, 1), ("b", True, 2), ("c", False, 1)):
-        wanted = DatasetSettings(n_static=2, seed=5, duration_s=0.5, video=video)
-        write_dataset(tmp_path / name, wanted, jobs=jobs)
-    names = [path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*") if path.is_file()]
-    assert len(names) == 2 * 4 + 1
-    for name in names:
-        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes(), name
-        if name.name != VIDEO_NAME:
-            assert (tmp_path / "c" / name).read_bytes() == (tmp_path / "a" / name).read_bytes(), name

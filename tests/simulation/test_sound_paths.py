@@ -1,11 +1,13 @@
 """Paths of sound against closed forms, a rigid wedge and Acoular; the direction of a hidden vehicle."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import Phase, assume, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from scipy.signal import resample_poly
 from simulated_sound import (
     ONE,
     OPEN,
@@ -15,18 +17,17 @@ from simulated_sound import (
     carried,
     error_db,
     noise,
+    rendered,
     source_in,
     srp_spectrum,
     street_of,
     tone,
 )
-from worldstate_lab.streets.simulated_windows import RATE_HZ, simulated_window_pair
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
-from worldstate.frontend.direction.feature import FEATURE_AZIMUTHS_RAD
 from worldstate.simulation import SimulationSettings, simulate_recording
 from worldstate.simulation.scene.driving import entry_y_m
-from worldstate.simulation.scene.junction import SITES, Site, drawn_site, site
+from worldstate.simulation.scene.junction import Site, drawn_site, site
 from worldstate.simulation.scene.occluders import OccludingBody
 from worldstate.simulation.scene.octave_bands import OCTAVES_HZ, octave_masks, split_octaves
 from worldstate.simulation.scene.vehicle import SOURCE_HEIGHT_M, EgoMotion, along
@@ -36,8 +37,10 @@ from worldstate.simulation.sound.delay import (
     SampledSignal,
     add_delayed,
 )
-from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, edge_gain, screen_attenuation_db
+from worldstate.simulation.sound.diffraction import EXTERIOR_RAD, screen_attenuation_db
 from worldstate.simulation.sound.paths import trace_paths
+from worldstate.simulation.sound.propagation import add_sources
+from worldstate.simulation.sound.scatter import add_scattered
 from worldstate.simulation.sound.static_field import StaticSources
 
 FS = 48_000.0
@@ -74,22 +77,18 @@ def test_free_field_waveform_equals_acoular():
     """Distance, delay and Doppler shift of a vehicle at three microphones."""
     from acoular_scene import Samples, render
 
-    speed, lane, y0, seconds = 13.0, 6.0, -9.0, 1.2
-    n = int(seconds * FS)
+    n = int(1.2 * FS)
     signal = np.fft.irfft(up_to(1800.0, n, 300.0), n)
     signal /= signal.std()
     positions = np.array([[0.0, 0.35, 1.7], [0.02, -0.31, 1.9], [-0.05, 0.04, 1.5]])
-    street = street_of(FREE_FIELD, positions, seconds, FS)
-    sent = source_in(
-        street, lambda time: signal[: len(time)], lambda time: (lane, y0 + speed * time), head_s=0.0
-    )
-    ours = carried(street, sent)
-    theirs = render(
-        MicrophoneArray(positions),
-        lambda time_s: np.array([lane, y0 + speed * time_s, SOURCE_HEIGHT_M]),
-        seconds,
-        signal=Samples(sample_freq=FS, num_samples=n, samples=signal),
-    )
+    street = street_of(FREE_FIELD, positions, 1.2, FS)
+
+    def place(time_s):
+        return 6.0, 13.0 * time_s - 9.0, SOURCE_HEIGHT_M
+
+    ours = carried(street, source_in(street, lambda time: signal[: len(time)], lambda t: place(t)[:2], 0.0))
+    samples = Samples(sample_freq=FS, num_samples=n, samples=signal)
+    theirs = render(MicrophoneArray(positions), lambda t: np.array(place(t)), 1.2, signal=samples)
     inner = slice(4800, min(len(theirs), ours.shape[1]) - 2000)
     for ours_one, theirs_one in zip(ours, theirs.T, strict=True):
         assert np.corrcoef(ours_one[inner], theirs_one[inner])[0, 1] > 0.999
@@ -149,17 +148,6 @@ def rigid_wedge_db(r, angle, r0, angle0):
     kernel = -nu / (2.0 * np.pi) * beta / (C * time)
     phases = np.exp(-2j * np.pi * OCTAVES_HZ[:, None] * time)
     return 20.0 * np.log10(np.abs(np.trapezoid(kernel * phases, eta)) * (r + r0))
-
-
-@pytest.mark.parametrize("shadow_deg", [1.0, 5.0, 20.0, 45.0, 75.0])
-@pytest.mark.parametrize(("r", "r0"), [(5.3, 5.4), (8.4, 14.0)])
-def test_a_corner_and_its_wall_equal_a_rigid_wedge(r, r0, shadow_deg):
-    """The diffracted wave and its mirror image in the wall have equal lengths and add up."""
-    angle0 = np.radians(12.0)
-    angle = np.pi + angle0 + np.radians(shadow_deg)
-    turns = np.array([angle - angle0, 2.0 * EXTERIOR_RAD - angle - angle0])
-    gain = edge_gain(turns, np.full(2, r * r0 / (r + r0)), np.zeros(2), OCTAVES_HZ).sum(axis=0)
-    np.testing.assert_allclose(20 * np.log10(gain), rigid_wedge_db(r, angle, r0, angle0), atol=1.0)
 
 
 @pytest.mark.parametrize("y", [4.6, 6.0, 20.0])
@@ -231,17 +219,16 @@ def band_noise(time: np.ndarray) -> np.ndarray:
     return found / found.std()
 
 
-def tones(time: np.ndarray) -> np.ndarray:
-    """Return 100 tones up to 5 kHz with constant level and no common phase."""
-    rng = np.random.default_rng(2)
-    shifts = rng.random((100, 2)) + np.arange(1, 101)[:, None] * [1, 0]
-    return sum(np.cos(2 * np.pi * (50.0 * number * time + phase)) for number, phase in shifts)
+def tones(time: np.ndarray, count: int = 100) -> np.ndarray:
+    """Return tones 50 Hz apart with constant level and no common phase."""
+    phases = np.random.default_rng(2).random(count)
+    return sum(np.cos(2 * np.pi * (50.0 * n * time + phase)) for n, phase in enumerate(phases, 1))
 
 
-def heard(plan: Site, way, seconds: float, height_m=HEIGHT_M, sound=band_noise) -> np.ndarray:
+def heard(plan: Site, way, seconds: float, sound=band_noise) -> np.ndarray:
     """Return the sound of a source on the route `way(t)`; it begins 0.4 s earlier, 130 m away."""
     street = street_of(plan, ONE, seconds, COARSE_FS)
-    return carried(street, source_in(street, sound, way, 0.4, height_m))
+    return carried(street, source_in(street, sound, way, 0.4, HEIGHT_M))
 
 
 def arrivals(lengths, gains, samples: int) -> np.ndarray:
@@ -251,15 +238,6 @@ def arrivals(lengths, gains, samples: int) -> np.ndarray:
     f = np.fft.rfftfreq(head + samples, 1 / COARSE_FS)
     response = (gains / lengths) @ np.exp(-2j * np.pi * f * lengths[:, None] / C)
     return np.fft.irfft(spectrum * response, head + samples)[-samples:]
-
-
-@settings(max_examples=12, deadline=None)
-@given(st.floats(-100.0, 100.0), st.floats(-60.0, 60.0), st.floats(0.05, 5.0))
-def test_open_space_has_gain_1_over_r_and_delay_r_over_c(x, y, height):
-    distance = np.sqrt(x**2 + y**2 + (HEIGHT_M - height) ** 2)
-    assume(distance >= 1.0)
-    (found,) = heard(OPEN, at(x, y), 0.15, height_m=height)
-    assert error_db(found, arrivals([distance], [1.0], len(found))) < -40.0
 
 
 def corridor(y: float, left: float, right: float, order: int) -> list[tuple[float, int]]:
@@ -320,12 +298,18 @@ def test_a_driving_ego_passes_a_source_in_its_street():
     assert error_db(found, expected) < -30.0
 
 
-def level_steps_db(plan: Site, way, speed_mps: float, seconds: float) -> np.ndarray:
-    """Return changes of level per tenth of a second along a route."""
-    (found,) = heard(plan, lambda time: way.at(speed_mps * time), seconds, sound=tones)
-    tenth = int(0.1 * COARSE_FS)
-    power = (found[: len(found) // tenth * tenth].reshape(-1, tenth) ** 2).mean(axis=1)
-    return np.diff(10 * np.log10(power))
+@pytest.mark.parametrize("name", ["SA1", "SB1"])
+def test_the_sound_of_a_street_does_not_depend_on_the_sample_rate(name):
+    """A vehicle with its images and rough walls at 6 kHz and at eight times that rate."""
+    plan, sounds = site(name), []
+    for rate_hz in (6_000.0, 48_000.0):
+        street = street_of(plan, ONE, 1.5, rate_hz, levels=replace(QUIET, wall_scattering=0.15))
+        source = source_in(street, partial(tones, count=20), lambda time: (plan.lanes_m[0], 8.0 - 6.0 * time))
+        add_sources(street, [source])
+        add_scattered(street, source)
+        sounds.append(rendered(street)[0])
+    inner = slice(300, -300)
+    assert error_db(sounds[0][inner], resample_poly(sounds[1], 1, 8)[: len(sounds[0])][inner]) < -30.0
 
 
 # Each takes half a second, so they are not shrunk.
@@ -338,7 +322,9 @@ def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, ar
     across, lane = side * beside, STREET.corner_ahead_m + beyond
     turn = (lane - 0.4, across + arm * 0.2), (lane, arm * 3.2)
     way = along(((-4.0, across), (3.0, across), *turn, (lane, arm * 9.0)))
-    steps = np.abs(level_steps_db(STREET, way, 1.5, 10.0))
+    (found,) = heard(STREET, lambda time: way.at(1.5 * time), 10.0, sound=tones)
+    tenths = found[: len(found) // 1200 * 1200].reshape(-1, 1200)
+    steps = np.abs(np.diff(10 * np.log10((tenths**2).mean(axis=1))))
     lit = np.abs(way.at(0.15 * (np.arange(len(steps)) + 2.0))[1]) < 3.3
     assert steps[lit].max() < 1.8
     assert steps.max() < 2.5
@@ -346,13 +332,11 @@ def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, ar
 
 def loudest_deg(plan: Site, approach: str, seed: int) -> np.ndarray:
     """Return the direction of the largest SRP per 0.25 s of a hidden approach, degrees, left positive."""
-    scene = SimulationSettings(
-        plan, approach, duration_s=1.5, entry_s=1.5, speed_mps=8.0, sample_rate_hz=RATE_HZ, preset=QUIET
-    )
-    audio = simulate_recording(scene, np.random.default_rng(seed)).audio[: int(1.25 * RATE_HZ)]
+    scene = SimulationSettings(plan, approach, 1.5, 1.5, 8.0, sample_rate_hz=5999.75, preset=QUIET)
+    audio = simulate_recording(scene, np.random.default_rng(seed)).audio[:7499]
     azimuths_deg = np.arange(-90.0, 91.0)
     powers = [
-        srp_spectrum(part.T, ovad_array(), RATE_HZ, azimuths_deg, (300.0, 1500.0))
+        srp_spectrum(part.T, ovad_array(), 5999.75, azimuths_deg, (300.0, 1500.0))
         for part in np.array_split(audio, 5)
     ]
     return azimuths_deg[np.argmax(powers, axis=1)]
@@ -373,22 +357,3 @@ def test_side_walls_move_the_loudest_direction_from_the_corner(approach):
     assert np.mean(np.abs(found) > 40.0) >= 0.8
     assert (found < -40.0).any()
     assert (found > 40.0).any()
-
-
-@pytest.mark.slow
-def test_in_the_full_scene_most_hidden_windows_peak_at_the_sides():
-    """At least 60 % beyond 40 degrees over the five sites; in real recordings 75 % are at 42 to 63."""
-    table, _ = simulated_window_pair(6, seed=3)
-    spectra = table.features.reshape(len(table), 2, -1).mean(axis=1)
-    beyond = np.abs(np.degrees(FEATURE_AZIMUTHS_RAD[spectra.argmax(axis=1)])) > 40.0
-    hidden = np.isin(table.labels, ("left", "right"))
-    shares = {name: beyond[hidden & (table.environments == name)].mean() for name in SITES}
-    assert np.mean(list(shares.values())) >= 0.6, shares
-
-
-@settings(max_examples=4, deadline=None, phases=(Phase.generate,))  # Half a second each
-@given(st.floats(3.6, 9.0), st.booleans())
-def test_the_level_is_continuous_past_a_wall_in_the_open(off, hidden):
-    """The route is behind the wall and past its end, or before it with its image."""
-    y = 2.6 + off if hidden else 1.0 - off
-    assert np.abs(level_steps_db(MERGE, along(((-9.0, y), (18.0, y))), 4.0, 6.0)).max() < 1.5

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import coherence, welch
@@ -38,9 +37,9 @@ from worldstate.simulation.stream.rendering import (
     render_blocks,
     row_times,
 )
-from worldstate.simulation.stream.settings import StreamSettings, Traffic, traffic_named
+from worldstate.simulation.stream.settings import StreamSettings, Traffic
 from worldstate.simulation.stream.truth import visible_s
-from worldstate.simulation.stream.writing import draw_stream, write_stream
+from worldstate.simulation.stream.writing import draw_stream
 
 # No source changes its level, so the rest is stationary.
 STILL = replace(preset(), name="still", far_rate=0.0, wave_fluctuation_db=0.0, ambient_waves=8)
@@ -57,8 +56,8 @@ def event_at(start_s: float, flow: str = "left", reach_m: float = 20.0) -> Vehic
     return VehicleEvent(flow, MANOEUVRES[flow](driver, np.random.default_rng(1)), start_s)
 
 
-def alone_in(scene: StreamScene, event: Event) -> EventSound:
-    rng = np.random.default_rng(2)
+def alone_in(scene: StreamScene, event: Event, rng: np.random.Generator | None = None) -> EventSound:
+    rng = rng or np.random.default_rng(2)
     return event_sound(event, site("SB1"), scene.settings.preset, scene.microphones, rng)
 
 
@@ -73,13 +72,13 @@ def test_a_stream_is_the_sum_of_background_and_events() -> None:
     early, late = event_at(-1.0, reach_m=8.0), event_at(34.5, reach_m=8.0)
     steps = SoundEvent(SoundSettings("steps", 2.0, 3.0, (3.0, 2.0)), 27.0)
     events = [early, event_at(28.5, reach_m=8.0), event_at(29.5, "turns_away", 10.0), late, steps]
-    blocks = list(render_blocks(scene, events))
+    # The two pieces of 30 s do not depend on the number of processes that render them.
+    blocks = list(render_blocks(scene, events, jobs=2))
     added = np.concatenate([block.pressure_pa for block in blocks], axis=1) - sound_of(scene, ())
     told_db = {number: levels[0] for block in blocks for number, levels in block.loudness_db.items()}
     expected = np.zeros((2, 36 * 3000))
     for number, event in enumerate(events):
-        rng = scene.settings.generator(EVENT, number)
-        alone = event_sound(event, scene.settings.site, scene.settings.preset, scene.microphones, rng)
+        alone = alone_in(scene, event, scene.settings.generator(EVENT, number))
         begin, end = max(alone.first, 0), min(alone.first + alone.pressure_pa.shape[1], expected.shape[1])
         expected[:, begin:end] += alone.pressure_pa[:, begin - alone.first : end - alone.first]
         rows_s = row_times(event, scene.settings)
@@ -106,27 +105,20 @@ def test_the_background_level_scales_the_background(where: str, level_db: float)
 
 def test_rain_of_a_stream_is_continuous_and_incoherent() -> None:
     dry = StreamSettings(site("SB1"), 1.2, 4, Traffic("test", {}), STILL, 3000.0)
-    raining = next(
-        one
-        for seed in range(9)
-        if (one := replace(dry, seed=seed, traffic=Traffic("test", {}, rain_share=0.5))).rain_db is not None
-    )
-    dry = replace(dry, seed=raining.seed)
-    rain = np.subtract(*(sound_of(draw_stream(one, PAIR).scene, ()) for one in (raining, dry)))
+    showers = [replace(dry, seed=seed, traffic=Traffic("test", {}, rain_share=1.0)) for seed in (1, 7)]
+    rain_db, rain = [one.rain_db for one in showers], []
+    assert None not in rain_db
+    for one in showers:
+        wet, alone = (draw_stream(stream, PAIR).scene for stream in (one, replace(dry, seed=one.seed)))
+        rain.append(sound_of(wet, ()) - sound_of(alone, ()))
     # Pieces of 30 s join at 30 and 60 s. Two seconds of two channels have 160 drops of exponential strength.
-    seconds_db = 10.0 * np.log10(np.square(rain).reshape(2, -1, 6000).mean(axis=(0, 2)))
+    seconds_db = 10.0 * np.log10(np.square(rain[0]).reshape(2, -1, 6000).mean(axis=(0, 2)))
     assert np.abs(seconds_db - np.median(seconds_db)).max() < 4.0
-    frequencies, between = coherence(*rain, 3000.0, nperseg=256)
+    frequencies, between = coherence(*rain[0], 3000.0, nperseg=256)
     assert between[frequencies > 500.0].mean() < 0.1
-    others = (replace(raining, seed=seed) for seed in range(99))
-    louder = next(one for one in others if one.rain_db is not None and one.rain_db > 5.0)
-    assert louder.rain_db is not None
-    assert raining.rain_db is not None
-    more = sound_of(draw_stream(louder, PAIR).scene, ()) - sound_of(
-        draw_stream(replace(dry, seed=louder.seed), PAIR).scene, ()
-    )
-    found_db = 10.0 * np.log10(np.square(more).mean() / np.square(rain).mean())
-    assert found_db == pytest.approx(louder.rain_db - raining.rain_db, abs=1.0)
+    found_db = 10.0 * np.log10([np.square(one).mean() for one in rain])
+    assert np.diff(rain_db)[0] > 10.0
+    np.testing.assert_allclose(np.diff(found_db), np.diff(rain_db), atol=1.0)
 
 
 def test_events_rise_to_line_of_sight_from_silence_to_silence() -> None:
@@ -159,9 +151,8 @@ def test_a_signal_is_added_to_the_unchanged_vehicle() -> None:
 def test_pieces_of_background_join_without_a_seam() -> None:
     scene = scene_of(2.0, rate_hz=2000.0)
     sound = sound_of(scene, ())
-    edges = [scene.piece * i for i in range(1, 4)]
-    overlap, whole = round(OVERLAP_S * 2000), sound.shape[1]
-    seam = np.zeros(whole, bool)
+    edges, overlap = [scene.piece * i for i in range(1, 4)], round(OVERLAP_S * 2000)
+    seam = np.zeros(sound.shape[1], bool)
     for edge in edges:
         seam[edge : edge + overlap] = True
     spectra = [
@@ -249,15 +240,3 @@ def test_the_stream_command_offers_all_traffic_and_reports_bad_options(tmp_path,
         assert problem in refusal(capsys, tmp_path, words)
     (tmp_path / "SB1-empty-1").mkdir()
     assert "something else" in refusal(capsys, tmp_path, "--minutes 1 --site SB1 --traffic empty")
-
-
-@pytest.mark.slow
-def test_one_process_and_two_write_the_same_bytes(tmp_path: Path) -> None:
-    settings = StreamSettings(site("SB1"), 1.2, 9, traffic_named("calm"), sample_rate_hz=4000.0)
-    written = [write_stream(tmp_path / str(jobs), settings, array=PAIR, jobs=jobs).folder for jobs in (1, 2)]
-    names = sorted(path.name for path in written[0].iterdir())
-    assert "out_multi.wav" in names and "vehicles.csv" in names
-    for name in names:
-        assert (written[0] / name).read_bytes() == (written[1] / name).read_bytes(), name
-    samples, rate = soundfile.read(written[0] / "out_multi.wav", dtype="float32")
-    assert samples.shape == (288_000, 2) and rate == 4000 and samples.std() > 1e-4
