@@ -10,10 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated_sound import PAIR
 
-from worldstate.adapters.camera.box_linking import overlaps
-from worldstate.adapters.camera.camera_health import degrade
 from worldstate.adapters.camera.detections import read_detections
-from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import VIDEO_NAME, open_video
 from worldstate.ground.errors import InputFileError, InvalidArgumentError, MissingExtraError
@@ -172,33 +169,6 @@ def test_the_parked_car_is_drawn_in_its_box():
     assert -3 < columns[-1] - right < 25
     assert rows[0] == pytest.approx(top, abs=4)
     assert -3 < rows[-1] - bottom < 15
-
-
-@pytest.fixture(scope="module")
-def passing():
-    """Return a car that crosses the image in 1.5 s, as large as the camera allows."""
-    return filmed(scene("SB2", "right", duration_s=2.0, entry_s=1.0), camera=PinholeCamera.ovad())
-
-
-def missed(recording, frames, family, d):
-    """Return the share of boxes with which a fresh motion detector has IoU below 0.3."""
-    detector, rng, misses = MotionDetector(), np.random.default_rng(0), []
-    for number, frame in enumerate(frames):
-        found = detector.detect(degrade(frame, family, d, rng))
-        if number >= max(recording.t0_frame, 10):
-            for seen in recording.detections[number]:
-                misses.append(not (overlaps(np.array([seen.box_px]), found.boxes_px) >= 0.3).any())
-    return np.mean(misses)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("family", ["blur", "darkness", "noise"])
-def test_a_motion_detector_loses_the_vehicle_in_degraded_frames_alone(family, passing):
-    """Levels and blur in pixels are those of the full image size."""
-    rates = [missed(*passing, family, d) for d in (0.0, 0.25, 1.0)]
-    assert rates[0] <= 0.1
-    assert rates[1] <= 0.2
-    assert rates[2] >= 0.9
 
 
 def test_video_without_frames_folder_or_opencv_raises_an_error(tmp_path, monkeypatch):

@@ -121,19 +121,14 @@ def test_approaches_have_the_requested_numbers_in_turn(seed: int) -> None:
 
 def test_followers_keep_their_headway_and_pairs_arrive_together() -> None:
     events = events_of(stream("SB1", "busy"), seed=3)
-    together = [[visible_s(e, site("SB1")) for e in events if e.flow == "both" and e.manoeuvre.arm == arm]
-                for arm in ("left", "right")]  # fmt: skip
-    left, right = (np.sort(np.array(times, dtype=float)) for times in together)
+    both = [(e.manoeuvre.arm, visible_s(e, site("SB1"))) for e in events if e.flow == "both"]
+    left, right = (np.array([s for side, s in both if side == arm], float) for arm in ("left", "right"))
     assert len(left) >= 3
     assert np.abs(left[:, None] - right).min(axis=1).max() < 4 * 0.7
-    for event in events:
-        if event.flow != "follows":
-            continue
-        same = [
-            e.start_s for e in events
-            if e is not event and e.manoeuvre.arrives_s == event.manoeuvre.arrives_s
-        ]  # fmt: skip
-        assert min(abs(event.start_s - start) for start in same) > 1.4
+    for event in (one for one in events if one.flow == "follows"):
+        others = (one for one in events if one is not event)
+        same = [one.start_s for one in others if one.manoeuvre.arrives_s == event.manoeuvre.arrives_s]
+        assert np.abs(np.array(same) - event.start_s).min() > 1.4
 
 
 @given(
@@ -167,9 +162,8 @@ def test_a_stop_follows_uniform_deceleration_and_acceleration(cruise, stop, stan
     driver = Driver(site("SB1"), LIGHT, "left", cruise, 0.0, 90.0)
     motion = driver.motion(route, (0.0, 90.0), [SpeedLimit(stop, 0.0, stands_s)])
     brake, away = cruise**2 / (2 * 2.0), cruise**2 / (2 * 1.5)
-    before = (stop - brake) / cruise + cruise / 2.0 if brake < stop else None
-    if before is not None:
-        stood = motion.time_s[(motion.driven_m == stop)]
+    if brake < stop:
+        before, stood = (stop - brake) / cruise + cruise / 2.0, motion.time_s[motion.driven_m == stop]
         np.testing.assert_allclose(stood, [before, before + stands_s], rtol=0.02, atol=0.05)
         if away < 90.0 - stop:
             after = cruise / 1.5 + (90.0 - stop - away) / cruise
@@ -194,13 +188,14 @@ def test_a_preset_scales_the_speed_of_vehicles_and_not_of_bicycles(factor, where
 
 def test_boxes_have_the_rates_of_misses_and_clutter() -> None:
     settings = stream("SB1", Traffic("test", {"left": 240.0}, kinds={"light": 1}), 10.0)
-    vehicles, events = truths_of(settings, 2), events_of(settings, 2)
-    frames = detected_frames(settings, events, [], np.random.default_rng(1))
-    alone = detected_frames(settings, [], [], np.random.default_rng(1))
+    frames, alone = (
+        detected_frames(settings, events, [], np.random.default_rng(1))
+        for events in (events_of(settings, 2), [])
+    )
     assert len(frames) == len(alone) == 6000
     added = np.array([len(a) - len(b) for a, b in zip(frames, alone, strict=True)])
     seen = np.zeros(len(frames), dtype=int)
-    for one in vehicles:
+    for one in truths_of(settings, 2):
         seen[np.rint(10 * one.time_s[one.in_view]).astype(int)] += 1
     clear = np.convolve(seen, np.ones(21), "same") == 0  # at least a second from any line of sight
     assert not added[clear].any()
@@ -215,9 +210,8 @@ def test_other_sounds_have_their_rate_and_rain_removes_boxes() -> None:
     rates = {"rain": 60.0, "voice": 240.0, "siren": 30.0}
     settings = stream("SB1", replace(traffic_named("busy"), sounds=rates))
     sounds = draw_sounds(settings, [4], np.random.default_rng(1))
-    for kind, rate in rates.items():
-        number = sum(one.sound.kind == kind for one in sounds)
-        assert abs(number - rate) < 4.5 * np.sqrt(rate)
+    numbers = Counter(one.sound.kind for one in sounds)
+    assert all(abs(numbers[kind] - rate) < 4.5 * np.sqrt(rate) for kind, rate in rates.items())
     assert all(0.0 <= one.start_s < 3600.0 for one in sounds)
     short = replace(settings, minutes=2.0)
     soaked = SoundEvent(SoundSettings("rain", 2.0, 58.0, lens_missed=0.999), 0.0)
@@ -270,35 +264,32 @@ def test_a_louder_background_reduces_the_range_and_not_the_sight() -> None:
 
 
 def test_background_levels_are_uniform_and_rain_has_its_share() -> None:
-    low_db, high_db = traffic_named("town-varied").background_db
-    streams = [StreamSettings(site("SA1"), 1.0, seed, traffic_named("town-varied")) for seed in range(400)]
-    above = np.array([one.drawn_preset.wind_100hz_db - one.preset.wind_100hz_db for one in streams])
-    octaves = np.array([one.drawn_preset.ambient_octaves_db for one in streams])
-    usual = np.array(streams[0].preset.ambient_octaves_db)
-    np.testing.assert_allclose(octaves - usual, np.tile(above[:, None], 8))
-    assert kstest(above, "uniform", (low_db, high_db - low_db)).pvalue > 1e-3
+    traffic, usual = traffic_named("town-varied"), preset()
+    streams = [StreamSettings(site("SA1"), 1.0, seed, traffic) for seed in range(400)]
+    above = np.array([one.drawn_preset.wind_100hz_db for one in streams]) - usual.wind_100hz_db
+    octaves = np.array([one.drawn_preset.ambient_octaves_db for one in streams]) - usual.ambient_octaves_db
+    np.testing.assert_allclose(octaves, np.tile(above[:, None], 8))
+    assert kstest(above, "uniform", (traffic.background_db[0], np.ptp(traffic.background_db))).pvalue > 1e-3
     rain_db = [one.rain_db for one in streams if one.rain_db is not None]
-    share = traffic_named("town-varied").rain_share
+    share = traffic.rain_share
     assert abs(len(rain_db) - 400 * share) < 4.0 * np.sqrt(400 * share * (1.0 - share))
     assert RAIN_DB[0] <= min(rain_db) < max(rain_db) <= RAIN_DB[1]
     # Nothing is drawn unless requested.
-    assert StreamSettings(site("SA1"), 1.0).drawn_preset == streams[0].preset
-    assert StreamSettings(site("SA1"), 1.0).rain_db is None
+    calm = StreamSettings(site("SA1"), 1.0)
+    assert calm.drawn_preset == usual and calm.rain_db is None
 
 
 def test_signals_belong_to_vehicles_and_bells_to_bicycles() -> None:
     shares = {"siren": 0.3, "bicycle-bell": 0.5}
     settings = stream("SB1", replace(traffic_named("busy"), signals=shares), 120.0)
-    events = events_of(settings, 4)
-    leaders = [event for event in events if event.flow not in ("follows", "far")]
-    riders = {
-        rides: [one for one in leaders if (one.manoeuvre.motion.kind.name in ("bicycle", "scooter")) == rides]
-        for rides in (True, False)
-    }
+    leaders = [event for event in events_of(settings, 4) if event.flow not in ("follows", "far")]
+    ridden = [one.manoeuvre.motion.kind.name in ("bicycle", "scooter") for one in leaders]
     for rides, signal in ((True, "bicycle-bell"), (False, "siren")):
-        warned = Counter(one.signal for one in riders[rides])
+        warned = Counter(
+            one.signal for one, is_ridden in zip(leaders, ridden, strict=True) if is_ridden == rides
+        )
         assert set(warned) <= {"", signal}
-        expected = shares[signal] * len(riders[rides])
+        expected = shares[signal] * warned.total()
         assert abs(warned[signal] - expected) < 4 * np.sqrt(expected)
     told = describe_events([vehicle_truth(0, leaders[0], settings)], [], {})["vehicles"][0]
     assert told["signal"] == (leaders[0].signal or None)
