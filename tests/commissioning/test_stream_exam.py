@@ -228,13 +228,10 @@ def test_curves_have_the_share_warned_by_a_time() -> None:
 
 def levels(seed: int, junctions: int, streams: int = 2) -> list[tuple[str, FloatArray]]:
     """Return hazard-free streams of half a minute at junctions, some louder or denied."""
-    rng, found = np.random.default_rng(seed), list[tuple[str, FloatArray]]()
-    for junction in range(junctions):
-        louder = rng.normal(0.0, 2.0)
-        wander = rng.normal(0.0, 0.5, (streams, 300)).cumsum(axis=1) + louder
-        denied = np.where(rng.random((streams, 300)) < 0.1, -np.inf, wander)
-        found += [(f"J{junction}", one) for one in denied]
-    return found
+    rng, shape = np.random.default_rng(seed), (junctions, streams, 300)
+    wander = rng.normal(0.0, 0.5, shape).cumsum(axis=-1) + rng.normal(0.0, 2.0, (junctions, 1, 1))
+    denied = np.where(rng.random(shape) < 0.1, -np.inf, wander)
+    return [(f"J{junction}", one) for junction, some in enumerate(denied) for one in some]
 
 
 def counted(streams: list[FloatArray], threshold_nats: float) -> tuple[float, float]:
@@ -366,13 +363,11 @@ def test_levels_of_a_stream_reproduce_the_advisories_of_the_filter(
 def test_inconsistent_curves_raise_an_error() -> None:
     good = measured_curve(levels(1, 3))
     onsets = good.onsets_per_hour
-    for wrong in (
-        *({"hours": 0.0}, {"threshold_nats": good.threshold_nats[::-1]}),
-        *({"onsets_per_hour": onsets[:-1]}, {"onsets_per_hour": onsets[::-1]}),
-        {"alpha_high": good.alpha_high + 1.0},
-    ):
-        with pytest.raises(InvalidArgumentError, match=next(iter(wrong))):
-            replace(good, **wrong)
+    wrong = [("onsets_per_hour", onsets[:-1]), ("onsets_per_hour", onsets[::-1]), ("hours", 0.0)]
+    wrong += [("threshold_nats", good.threshold_nats[::-1]), ("alpha_high", good.alpha_high + 1.0)]
+    for name, value in wrong:
+        with pytest.raises(InvalidArgumentError, match=name):
+            replace(good, **{name: value})
 
 
 def test_two_quiet_junctions_give_a_threshold_without_alarms_and_one_gives_none() -> None:

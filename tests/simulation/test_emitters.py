@@ -67,12 +67,6 @@ def a_weighting_filter(fs):
     return zpk2sos(*bilinear_zpk(np.zeros(4), poles, gain, fs))
 
 
-def power_spectrum(x, fs=FS):
-    """Return frequencies and power at a resolution of 4 Hz."""
-    frequencies, _, spectra = stft(x, fs, nperseg=int(fs / 4))
-    return frequencies, (np.abs(spectra) ** 2).mean(axis=1)
-
-
 def envelope(x, fs=FS, rate=100):
     """Return the RMS 100 times per second."""
     block = int(fs / rate)
@@ -142,21 +136,14 @@ def test_sounds_have_their_energy_in_their_band(sounds, name, low_hz, high_hz, l
     assert band_power(sounds[name], FS, low_hz, high_hz) > least * band_power(sounds[name], FS, -1.0)
 
 
-def test_a_church_bell_has_a_minor_third(sounds):
-    frequencies, power = power_spectrum(sounds["bell"])
-    peaks = find_peaks(power, height=power.max() * 1e-3)[0]
-    strong = frequencies[peaks]
-    ratios = strong[:, None] / strong
-    assert (np.abs(ratios - 1.2) < 0.015).any() and (np.abs(ratios - 2.0) < 0.015).any()
-
-
 def test_lines_of_a_machine_follow_its_speed():
     matched, unmoved = [], []
     for seed in range(8):
-        (hz, fast), (_, slow) = (
-            power_spectrum(motor_sound(np.full(int(2 * FS), speed), FS, np.random.default_rng(seed)))
-            for speed in (1.0, 0.5)
+        sounds = (
+            motor_sound(np.full(int(2 * FS), speed), FS, np.random.default_rng(seed)) for speed in (1.0, 0.5)
         )
+        # At a resolution of 4 Hz.
+        (hz, fast), (_, slow) = (welch(one, FS, "hann", int(FS / 4)) for one in sounds)
         # Noise has the same octaves at either speed; only lines change.
         for found, spectrum in ((matched, np.interp(hz / 2.0, hz, slow)), (unmoved, slow)):
             found.append(np.corrcoef(np.log(spectrum), np.log(fast))[0, 1])
@@ -180,14 +167,6 @@ def test_steps_have_the_rate_of_a_walker(sounds):
     # Heel and sole are 0.14 s apart, so a further step is at least a third of a second later.
     heels = find_peaks(swell, height=0.3 * swell.max(), distance=33)[0]
     assert np.diff(heels).mean() / 100 == pytest.approx(1 / 1.9, rel=0.15)
-
-
-def test_music_has_a_constant_beat(sounds):
-    kick = split_octaves(sounds["music"], FS)[0]
-    swell = envelope(kick) - envelope(kick).mean()
-    likeness = np.correlate(swell, swell, "full")[len(swell) :]
-    beat = (35 + likeness[35:80].argmax() + 1) / 100
-    assert 60 / 130 - 0.02 <= beat <= 60 / 95 + 0.02
 
 
 @settings(max_examples=6, deadline=None)
