@@ -1,14 +1,21 @@
-"""Faulty microphones are found, classified and left out; healthy arrays raise no fault."""
+"""Faulty microphones, cards and clocks are found, classified and left out; healthy arrays raise no fault."""
+
+import re
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plane_waves import array_check, position_check
+from scipy.ndimage import map_coordinates
 
-from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_array_56
-from worldstate.frontend.health.channel_health import ArrayHealth
+from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
+from worldstate.frontend.health.channel_health import ArrayHealth, ChannelFault
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.values import NotUsable
+from worldstate.operations.recordings.channel_report import HealthLog
 from worldstate.simulation import draw_settings, simulate_recording
 
 RATE = 16_000
@@ -18,20 +25,27 @@ SECONDS = 3.5
 
 
 def street(
-    array: MicrophoneArray, seed: int, seconds: float = SECONDS, waves: int = 10, slope: float = 1.0
+    array: MicrophoneArray,
+    seed: int,
+    seconds: float = SECONDS,
+    waves: int = 10,
+    slope: float = 1.0,
+    rate: int = RATE,
 ) -> np.ndarray:
-    """Red noise from many directions of the half circle ahead, and each microphone's own noise, (n, M)."""
-    rng, n = np.random.default_rng(seed), round(seconds * RATE)
-    frequencies = np.fft.rfftfreq(n, 1 / RATE)
-    colour = (1.0 + frequencies / 300.0) ** -slope
-    colour[frequencies > 0.45 * RATE] = 0.0
-    sound = np.zeros((len(frequencies), array.n_microphones), complex)
-    for azimuth in rng.uniform(-1.5, 1.5, waves):
-        wave = np.fft.rfft(rng.standard_normal(n) * rng.uniform(0.3, 1.0)) * colour
-        sound += wave[:, None] * array.steering(frequencies, azimuth, rng.normal(0, 0.2))[:, :, 0]
-    heard = np.fft.irfft(sound, n, axis=0)
-    own = 0.03**slope * heard.std() * rng.standard_normal(heard.shape)
-    return np.asarray((heard + own) / heard.std(), np.float32)
+    """Red noise of changing level from many directions, every microphone 0.3 dB and 0.02 ms off, (n, M)."""
+    rng, n = np.random.default_rng(seed), round(seconds * rate)
+    frequencies, ends = np.fft.rfftfreq(n, 1 / rate), np.arange(0, n + rate, rate)
+    colour = (1.0 + frequencies / 300.0) ** -slope * (frequencies < 0.45 * rate)
+    own_delay = 2e-5 * rng.standard_normal(array.n_microphones)
+    sound = np.zeros((len(frequencies), array.n_microphones), np.complex64)
+    for azimuth in rng.uniform(-np.pi, np.pi, waves):
+        level = np.exp(np.interp(np.arange(n), ends, rng.normal(0, 0.5, len(ends))))
+        wave = np.fft.rfft(rng.standard_normal(n) * level) * colour
+        late = array.delays_s(azimuth, abs(rng.normal(0, 0.1))) + own_delay
+        sound += wave[:, None] * np.exp(-2j * np.pi * frequencies[:, None] * late)
+    heard = np.fft.irfft(sound, n, axis=0) * 10.0 ** (0.3 * rng.standard_normal(array.n_microphones) / 20.0)
+    heard += 0.03**slope * heard.std() * rng.standard_normal(heard.shape)
+    return np.asarray(heard / heard.std(), np.float32)
 
 
 def healths(array: MicrophoneArray, sound: np.ndarray, rate: float = RATE) -> list[ArrayHealth]:
@@ -182,7 +196,7 @@ def test_a_dying_channel_causes_no_step_in_looming_and_levels() -> None:
 
 
 def test_dropouts_are_found_at_their_samples() -> None:
-    sound = street(HALF, 14, seconds=6.0, slope=2.0)
+    sound = street(HALF, 12, seconds=6.0, slope=2.0)
     cut = np.delete(sound, np.arange(30_000, 30_777), axis=0)
     cut[50_000:50_300] = cut[49_999]
     cut[70_000:70_800] = cut[69_200:70_000]
@@ -209,3 +223,111 @@ def test_lost_packets_are_no_microphone_faults():
     assert frames[-1].health.n_dropouts == 3
     assert all(frame.health.mask.keep.all() for frame in frames)
     assert not any(frame.health.faults for frame in frames)
+
+
+# Cards and clocks at a low sample rate, in a large and in a small array. A second clock is found after 10 s
+# among many channels and after 15 to 30 s among eight.
+LOW = 6000
+ARRAYS = {56 // step: MicrophoneArray(ovad_array().positions_m[::step]) for step in (2, 7)}
+CARD = {28: slice(8, 16), 8: slice(4, 8)}
+SECONDS_OF = {28: 11.0, 8: 20.0}
+
+Spoil = Callable[[np.ndarray, int, np.random.Generator], dict[str, set[int]]]
+
+
+@cache
+def low_street(n_channels: int) -> np.ndarray:
+    return street(ARRAYS[n_channels], 7, SECONDS_OF[n_channels], rate=LOW)
+
+
+def gain(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    x[:, m - 2] *= 2.0
+    return {"level": {m - 2}}
+
+
+def gusts(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    hit = rng.choice(m, 3, replace=False)
+    for channel in hit:
+        for start in rng.integers(0, len(x) - LOW, 3):
+            x[start : start + LOW, channel] += 4.0 * rng.standard_normal(LOW)
+    return {"gusts": set(hit.tolist())}
+
+
+def offset(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    return {"delayed": resampled(x, m, 3e-4 * LOW * np.ones(len(x)))}
+
+
+def drift(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    return {"drifting": resampled(x, m, 5e-5 * np.arange(len(x)))}
+
+
+def resampled(x: np.ndarray, m: int, late_samples: np.ndarray) -> set[int]:
+    places, channels = [np.arange(len(x)) - late_samples], range(m)[CARD[m]]
+    for channel in channels:
+        x[:, channel] = map_coordinates(x[:, channel].astype(float), places, order=5, mode="nearest")
+    return set(channels)
+
+
+def exchange(x: np.ndarray, m: int, rng: np.random.Generator) -> dict[str, set[int]]:
+    pair = [1, m // 2]
+    x[:, pair] = x[:, pair[::-1]]
+    return {"swapped": set(pair)}
+
+
+def heard(array: MicrophoneArray, sound: np.ndarray) -> tuple[dict[str, set[int]], list[ChannelFault]]:
+    """Return the faults of the whole recording and those of the last hop."""
+    log, kinds = HealthLog(), {}
+    frames = FrontEnd(array, LOW).process(sound)
+    for frame in frames:
+        log.add(frame)
+    for verdict in log.summary().verdicts:
+        kinds.setdefault(verdict.fault.value, set()).add(verdict.channel)
+    return kinds, list(frames[-1].health.faults)
+
+
+@pytest.mark.parametrize("n_channels", ARRAYS)
+def test_a_healthy_array_is_silent(n_channels: int) -> None:
+    assert heard(ARRAYS[n_channels], low_street(n_channels)) == ({}, [])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("spoil", "n_channels"),
+    [(exchange, 28), *((spoil, n) for spoil in (gain, gusts, offset, drift) for n in ARRAYS)],
+)
+def test_each_timing_fault_is_found_alone(spoil: Spoil, n_channels: int) -> None:
+    sound = low_street(n_channels).copy()
+    expected = spoil(sound, n_channels, np.random.default_rng(3))
+    kinds, latest = heard(ARRAYS[n_channels], sound)
+    assert kinds == expected
+    if spoil is gusts:
+        return
+    assert {fault.channel for fault in latest} == next(iter(expected.values()))
+    size = {"level": 6.0, "delayed": 3e-4, "drifting": 5e-5}.get(latest[0].fault.value)
+    if size is not None:
+        assert latest[0].value == pytest.approx(size, rel=0.25)
+    # The least of the five faults must be known well enough to be believed.
+    assert latest[0].std is None or latest[0].std < 0.2 * abs(latest[0].value)
+
+
+def order_of(sound: np.ndarray) -> tuple[int, ...] | None:
+    """Return the order of eight channels that fits better than the claimed one."""
+    return position_check(ARRAYS[8], sound, LOW).verdict(np.ones(8, bool)).order
+
+
+@pytest.mark.parametrize(("a", "b"), [(0, 7), (1, 4), (2, 6), (5, 7)])
+def test_an_exchange_of_eight_is_found_by_the_positions_alone(a: int, b: int) -> None:
+    expected, sound = np.arange(8), low_street(8).copy()
+    expected[[a, b]], sound[:, [a, b]] = [b, a], sound[:, [b, a]]
+    assert order_of(sound) == tuple(expected)
+
+
+def test_array_check_prints_the_delay_of_a_late_card(tmp_path, capsys):
+    sound = low_street(8)[: 12 * LOW].copy()
+    offset(sound, 8, np.random.default_rng(0))
+    assert array_check(tmp_path, ARRAYS[8], 0.1 * sound, LOW) == 1
+    lines = capsys.readouterr().out.splitlines()
+    (row,) = (line for line in lines if "delayed" in line and "%" in line)
+    assert row.split()[:2] == ["5-8", "delayed"]
+    assert re.search(r"0\.(2[5-9]|3[0-5]) \+- 0\.0\d ms later than the others", row)
+    assert lines[-1] == "not healthy: delayed 5, 6, 7, 8; 4 excluded by the front-end"
