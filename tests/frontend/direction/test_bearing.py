@@ -1,14 +1,19 @@
-"""SRP-PHAT and MUSIC against pyroomacoustics; the stated error of a bearing, which is large for noise."""
+"""SRP-PHAT and MUSIC against pyroomacoustics, pair delays, and the stated error of a bearing."""
 
 import numpy as np
 import pyroomacoustics
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plane_waves import noise_from, plane_wave
+from scipy.signal import ShortTimeFFT
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
 from worldstate.frontend.array.steering import Steering
-from worldstate.frontend.direction.bearing import AcousticBearing, BearingScatter, find_peaks, srp_phat
+from worldstate.frontend.bounds.cramer_rao import delay_crb_s2
+from worldstate.frontend.direction.bearing import AcousticBearing, BearingScatter, srp_phat
 from worldstate.frontend.direction.feature import feature_nfft
+from worldstate.frontend.direction.gcc_phat import all_pairs, gcc_delays
 from worldstate.frontend.direction.music import count_sources, covariance, music_spectrum, signal_subspace
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.stft import StreamingStft, band_bins, bin_frequencies_hz
@@ -17,10 +22,6 @@ from worldstate.ground.typing import FloatArray
 
 AZIMUTHS = np.radians(np.arange(-90.0, 91.0))
 BAND = (300.0, 1800.0)
-
-
-def beams(array: MicrophoneArray, rate: float = 48_000.0) -> Steering:
-    return Steering.towards(array, bin_frequencies_hz(band_bins(BAND, rate, 512), rate, 512), AZIMUTHS)
 
 
 @pytest.mark.parametrize("rate", [47_998.0, 16_000.0])
@@ -38,20 +39,10 @@ def test_equals_pyroomacoustics_on_the_same_frames(layout: str, rate: float) -> 
     peer = pyroomacoustics.doa.SRP(array.positions_m.T, rate, 512, c=343.0, azimuth=AZIMUTHS)
     peer.locate_sources(frames.transpose(2, 1, 0).astype(np.complex128), freq_range=list(BAND))
     bins = band_bins(BAND, rate, 512)
-    ours = srp_phat(frames[:, bins.start : bins.stop], beams(array, rate))
-    assert np.corrcoef(ours, peer.grid.values)[0, 1] > 0.999999
+    beams = Steering.towards(array, bin_frequencies_hz(bins, rate, 512), AZIMUTHS)
+    ours = srp_phat(frames[:, bins.start : bins.stop], beams)
     m = array.n_microphones
     np.testing.assert_allclose(ours * 2 * m / (m - 1), peer.grid.values, rtol=2e-5)
-
-
-@pytest.mark.parametrize("azimuth_deg", [-70.0, -20.4, 0.3, 33.7, 60.0])
-def test_bearing_is_finer_than_the_grid(azimuth_deg: float) -> None:
-    array = roof_array_56()
-    sound = noise_from(array, np.radians(azimuth_deg), 47_998.0, 1.0, 3)
-    bins = band_bins(BAND, 47_998, 512)
-    spectrum = srp_phat(StreamingStft(56, 512, bins).push(sound), beams(array, 47_998.0))
-    found_deg = np.degrees(find_peaks(spectrum, AZIMUTHS)[0].azimuth_rad)
-    assert abs(found_deg - azimuth_deg) < 0.1 / np.cos(np.radians(azimuth_deg))
 
 
 RATE = 6000
@@ -154,6 +145,7 @@ def test_the_error_covers_both_of_two_equal_sources(microphones: int) -> None:
     assert alone.bearing_std_rad <= weak.bearing_std_rad < 0.6 * both.bearing_std_rad
 
 
+BINS_HZ = np.arange(300.0, 1800.0, 50.0)
 # The bins from 281 to 1688 Hz.
 BINS = np.arange(3, 19)
 FREQUENCIES = bin_frequencies_hz(range(3, 19), 48_000, 512)
@@ -205,3 +197,58 @@ def test_number_of_sources(microphones, frames, truths, azimuths_deg):
         X = spectra_of(array, np.deg2rad(azimuths_deg[:truth]), rng, frames)
         hits += count_sources(np.linalg.eigvalsh(covariance(X)), frames) == truth
     assert hits >= 0.9 * len(truths)
+
+
+def delayed(delays, rng, frames=40, noise=0.0):
+    """One wave at microphones with these arrival times: spectra (frames, bins, M)."""
+    wave = circular(rng, frames, len(BINS_HZ), 1)
+    shift = np.exp(-2j * np.pi * BINS_HZ[:, None] * np.asarray(delays))
+    return wave * shift + noise * circular(rng, frames, len(BINS_HZ), len(delays))
+
+
+@settings(max_examples=50, deadline=None)
+@given(arrivals=st.lists(st.floats(-1e-3, 1e-3), min_size=2, max_size=5))
+def test_noiseless_delays_are_exact_between_samples(arrivals):
+    X = delayed(arrivals, np.random.default_rng(0))
+    got = gcc_delays(X, BINS_HZ, 2.5e-3)
+    i, j = all_pairs(len(arrivals)).T
+    np.testing.assert_allclose(got.delay_s, np.take(arrivals, i) - np.take(arrivals, j), atol=1e-12)
+    np.testing.assert_allclose(got.peak, 1.0, atol=1e-9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("snr", [1.0, 10.0, 100.0])
+def test_variance_meets_the_bound(snr):
+    rng = np.random.default_rng(int(snr))
+    frames, truth, trials = 60, 1.37e-4, 600
+    errors = []
+    for _ in range(trials):
+        X = delayed([truth, 0.0], rng, frames=frames, noise=snr**-0.5)
+        errors.append(gcc_delays(X, BINS_HZ, 3e-3).delay_s[0] - truth)
+    coherence = (snr / (1 + snr)) ** 2
+    spacing = BINS_HZ[1] - BINS_HZ[0]
+    # The sum over bins as an integral: frames of 1 / spacing seconds each, half a bin added at either end.
+    edges = np.array([BINS_HZ[0] - spacing / 2, BINS_HZ[-1] + spacing / 2])
+    fine = np.linspace(*edges, 2000)
+    bound = delay_crb_s2(fine, np.full(fine.size, coherence), frames / spacing)
+    ratio_db = 10 * np.log10(np.var(errors) / bound)
+    sampling_db = 10 * np.log10(1 - 3.0 * np.sqrt(2 / trials))
+    assert sampling_db < ratio_db < 1.5
+    assert abs(np.mean(errors)) < 4 * np.sqrt(bound / trials)
+
+
+def test_delay_of_a_stream_through_a_windowed_stft():
+    rng = np.random.default_rng(6)
+    sound, rate = rng.normal(size=48_000), 48_000
+    pair = np.stack([sound[100:-100], sound[93:-107]], axis=-1)  # the second hears everything 7 samples later
+    stft = ShortTimeFFT(np.hanning(512), 256, rate)
+    X = np.moveaxis(stft.stft(pair, axis=0), (0, 1, 2), (1, 2, 0))
+    band = (stft.f > 300) & (stft.f < 1800)
+    late = gcc_delays(X[:, band], stft.f[band], 1e-3)
+    assert late.delay_s[0] == pytest.approx(-7 / rate, abs=0.02 / rate)
+
+
+def test_a_dead_microphone_has_no_peak():
+    X = delayed([0.0, 1e-4, 0.0], np.random.default_rng(2), frames=4000, noise=1.0)
+    X[..., 2] = 0.0
+    assert gcc_delays(X, BINS_HZ, 1e-3).peak[1] == 0.0
