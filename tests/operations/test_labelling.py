@@ -1,15 +1,13 @@
-"""Labels of passes of a simulated camera: tracks, T0 and hidden positions."""
+"""Passes of a simulated camera: labels with T0 and hidden positions, and streets learned from them."""
 
 import json
 import math
-import os
-import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 from matplotlib.figure import Figure
 from passing_boxes import CAMERA, EDGE_RAD, LANE_M, passing
 
@@ -18,10 +16,19 @@ from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.cli.main import main
-from worldstate.ground.errors import InputFileError
+from worldstate.ground.errors import InputFileError, MissingExtraError, SchemaVersionError
 from worldstate.operations.labelling.label_files import file_below, open_label, pass_windows
 from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks, label_passes
 from worldstate.operations.labelling.street_figure import draw_passes
+from worldstate.operations.labelling.street_passes import (
+    HeardStreet,
+    read_street,
+    streets_after,
+    watched_recording,
+    write_street,
+)
+from worldstate.smoothing.learned_street import LearnedStreet, context_of
+from worldstate.state.context import Rates
 
 
 def t0_s(start_s: float, speed: float) -> float:
@@ -58,35 +65,21 @@ def test_hidden_positions_are_within_intervals_that_are_not_too_wide(labelled):
         assert 0.6 < stated_m < 2.3
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("missing", "told"), [("gtsam", "RTS smoother"), ("gtsam filterpy", "[smoothing]")])
-def test_without_gtsam_the_rts_smoother_makes_the_labels(missing, told):
-    program = """
-import sys
-sys.modules |= dict.fromkeys(sys.argv[1].split())
-import numpy as np
-from passing_boxes import CAMERA, passing
-from worldstate.adapters.camera.detections import DetectionFilter
-from worldstate.ground.errors import MissingExtraError
-from worldstate.operations.labelling.pass_labels import box_tracks
-from worldstate.operations.labelling.pass_labels import label_passes
-log = passing([(1.0, 1), (1.5, -1)], 5.0, np.random.default_rng(0))
-try:
-    for one in label_passes(box_tracks(log, CAMERA, DetectionFilter())):
-        print(one.track.smoother, one.t0.time_s, *one.track.states[30, :2], one.track.time_s[30], sep=",")
-except MissingExtraError as error:
-    print(error)
-"""
-    path = os.pathsep.join([*filter(None, sys.path), str(Path(__file__).parents[1])])
-    call, env = [sys.executable, "-c", program, missing], os.environ | {"PYTHONPATH": path}
-    printed = subprocess.check_output(call, env=env, text=True)
-    assert told in printed
-    for (start, side), line in zip([(1.0, 1), (1.5, -1)], printed.splitlines(), strict=False):
-        if told == "RTS smoother":
-            at_s, x, y, hidden_s = map(float, line.split(",")[1:])
-            assert abs(at_s - t0_s(start, 5.0)) < 0.1
-            # Two seconds before T0.
-            assert math.hypot(x - LANE_M, y - side * (20.0 - 5.0 * (hidden_s - start))) < 2.0
+@pytest.mark.parametrize("missing", [["gtsam"], ["gtsam", "filterpy"]])
+def test_without_gtsam_the_rts_smoother_makes_the_labels(missing, labelled, monkeypatch):
+    starts, tracks, _ = labelled
+    for name in missing:
+        monkeypatch.setitem(sys.modules, name, None)
+    if "filterpy" in missing:
+        with pytest.raises(MissingExtraError, match=r"\[smoothing\]"):
+            label_passes(tracks)
+        return
+    for (start, side), one in zip(starts, label_passes(tracks), strict=True):
+        assert one.track.smoother == "RTS smoother"
+        assert abs(one.t0.time_s - t0_s(start, 5.0)) < 0.1
+        # Two seconds before T0.
+        (x, y), hidden_s = one.track.states[30, :2], one.track.time_s[30]
+        assert math.hypot(x - LANE_M, y - side * (20.0 - 5.0 * (hidden_s - start))) < 2.0
 
 
 def test_vehicles_ahead_or_standing_have_no_arm():
@@ -164,8 +157,6 @@ def test_a_list_of_labels_is_beside_or_above_its_recording(tmp_path):
 @pytest.fixture
 def recording(tmp_path):
     """Write a silent recording with boxes of two passes; return the options of the command."""
-    import soundfile
-
     rng = np.random.default_rng(1)
     folder = tmp_path / "street"
     folder.mkdir()
@@ -209,3 +200,93 @@ def test_training_reads_the_labels(recording, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["n_windows"] == 60 + told["n_labelled"] == 60 + len(read_labels(windows, tmp_path))
     assert 0.0 <= told["fano_bound"] <= 1.0
+
+
+SPEED = 6.0
+
+
+@pytest.fixture(scope="module")
+def watched():
+    starts = [(1.0, 1), (9.0, -1), (17.0, 1)]
+    log = passing(starts, SPEED, np.random.default_rng(0))
+    return watched_recording(log, CAMERA, DetectionFilter(), 30.0)
+
+
+@pytest.fixture(scope="module")
+def street(watched):
+    return list(streets_after(LearnedStreet("Elm Street"), watched))
+
+
+def test_every_pass_is_counted_and_all_time_is_exposure(street):
+    assert [sum(arm.arrivals for arm in one.arms) for one in street] == [1.0, 2.0, 3.0, 3.0]
+    assert [arm.exposure_s for arm in street[-1].arms] == pytest.approx([30.0, 30.0])
+
+
+def test_edges_and_paces_of_the_street_are_learned(street):
+    for arm in street[-1].arms:
+        assert abs(arm.edge.mean_rad - EDGE_RAD) < math.radians(1.5)
+        seen = math.exp(arm.log_pace.total / arm.log_pace.weight)
+        assert seen == pytest.approx(SPEED / LANE_M, rel=0.15)
+
+
+def test_sound_of_two_arms_at_once_is_not_assigned(watched):
+    first, *_ = watched.passes
+    times = np.arange(0.1, 30.0, 0.1)
+    heard = HeardStreet(times, np.zeros((len(times), 12)), np.ones(len(times)), "roof")
+    assert len(heard.before(first, watched.passes).weights) == 30
+    beside = replace(first, arm="right", t0=replace(first.t0, time_s=first.t0.time_s + 2.0))
+    assert heard.before(first, [first, beside]) is None
+    assert heard.before(replace(first, t0=replace(first.t0, time_s=99.0)), [first]) is None
+
+
+@pytest.fixture
+def told(street, tmp_path):
+    """Return the content of a street file."""
+    write_street(tmp_path / "street.json", street[-1])
+    return json.loads((tmp_path / "street.json").read_text())
+
+
+def read_again(told, folder, version="1.3.0"):
+    told["schema"]["version"] = version
+    (folder / "street.json").write_text(json.dumps(told))
+    return read_street(folder / "street.json")
+
+
+@pytest.mark.parametrize("version", ["1.1.0", "1.2.0"])
+def test_rates_and_camera_misses_of_an_older_street_file_are_ignored(street, told, tmp_path, version):
+    for arm in told["arms"]:
+        arm["reveals"] = arm["departures"] = {"count": 3.0, "exposure_s": 7.0}
+    before = read_again(told | {"looks": [3.0] * 18, "missed": [1.0] * 18}, tmp_path, version)
+    assert before == street[-1]
+    assert context_of(before).rates == Rates()
+    with pytest.raises(SchemaVersionError, match=r"2\.0\.0"):
+        read_again(told, tmp_path, "2.0.0")
+
+
+def test_a_street_file_with_wrong_arms_raises_an_error(told, tmp_path):
+    told["arms"].reverse()
+    with pytest.raises(InputFileError, match="expected the arms"):
+        read_again(told, tmp_path)
+
+
+@pytest.mark.long
+def test_the_learn_command_continues_a_street_and_run_uses_it(approach, tmp_path, capsys):
+    out, figure = tmp_path / "street.json", tmp_path / "street.png"
+    told = ["street", "learn", str(approach.folder), "--out", str(out)]
+    assert main([*told, "--site", "here", "--figure", str(figure), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["n_passes"] == sum(arm["arrivals"] for arm in found["arms"].values())
+    assert figure.stat().st_size > 0
+    first = read_street(out)
+    # Sound was read with the shipped model; one pass is too few to learn the sides.
+    assert sum(first.patterns.weights) > 0.0
+    assert found["sides_heard"] is False
+    assert main([*told, "--known", str(out), "--days", "1"]) == 0
+    again = read_street(out)
+    assert again.site == "here"
+    # The weight decays with a time constant of 30 days.
+    assert again.arms[0].exposure_s == pytest.approx(first.arms[0].exposure_s * (1.0 + math.exp(-1 / 30)))
+    states = tmp_path / "states.jsonl"
+    assert main(["run", str(approach.folder), "--context", str(out), "--out", str(states)]) == 0
+    context = json.loads(states.read_text().splitlines()[-1])["context"]
+    assert context["site"] == "here"

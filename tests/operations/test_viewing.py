@@ -1,9 +1,10 @@
-"""Figures of snapshots: what stands in them, and where the command refuses."""
+"""Figures of snapshots: their content and colours, refusals of the command, and files that stay whole."""
 
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 import soundfile
@@ -12,13 +13,23 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scripted_states import scripted_states
 
-from worldstate.adapters.datasets.ovad import TrueTrack, read_true_tracks
+from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError
-from worldstate.operations.figure_style import with_gaps
+from worldstate.operations.figure_style import (
+    CATEGORIES,
+    DECISION,
+    HEARD,
+    HIDDEN,
+    IN_VIEW,
+    SEARCHED,
+    TRUTH,
+    figure_file,
+    legend_beside,
+    with_gaps,
+)
 from worldstate.operations.viewing import state_figure
 from worldstate.operations.viewing.state_figure import (
-    SoundPower,
     write_animation,
     write_birds_eye,
     write_state_figure,
@@ -40,15 +51,6 @@ def log(states, tmp_path_factory):
     return path
 
 
-def pixels(path):
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"), dtype=int)
-
-
-def reddish(image):
-    return (image[..., 0] > image[..., 2] + 60).sum(axis=0)
-
-
 def test_the_figure_over_time_names_its_panels(log, tmp_path):
     assert main(["log", "plot", str(log), "--out", str(tmp_path / "states.svg")]) == 0
     text = (tmp_path / "states.svg").read_text()
@@ -66,10 +68,12 @@ def test_a_state_plots_itself_on_new_and_on_given_axes(states):
     pyplot.close("all")
 
 
-def test_who_is_hidden_on_the_left_is_drawn_on_the_left(states, tmp_path):
+def test_a_vehicle_hidden_on_the_left_is_drawn_on_the_left(states, tmp_path):
     write_birds_eye(states[0], tmp_path / "above.png")
-    red = reddish(pixels(tmp_path / "above.png"))
-    left, right = np.split(red[: red.size // 2 * 2], 2)
+    with Image.open(tmp_path / "above.png") as image:
+        shown = np.asarray(image.convert("RGB"), dtype=int)
+    red = shown[..., 0] > shown[..., 2] + 60
+    left, right = np.array_split(red, 2, axis=1)
     assert left.sum() > 3 * right.sum()
 
 
@@ -82,12 +86,9 @@ def test_an_animation_has_a_frame_for_every_state_at_the_speed_of_the_run(states
 
 
 def test_the_snapshot_nearest_to_the_time_is_drawn(log, states, tmp_path, capsys):
-    stamps_s = [state.stamp_ns / 1e9 for state in states]
-    assert all(a < b for a, b in pairwise(stamps_s))
-    above = str(tmp_path / "above.png")
-    words = ["log", "plot", str(log), "--birds-eye", above, "--time", f"{stamps_s[2] + 0.03}"]
-    assert main([*words, "--json"]) == 0
-    assert f'"birds_eye_s": {stamps_s[2]}' in capsys.readouterr().out
+    above, time_s = str(tmp_path / "above.png"), states[2].stamp_ns / 1e9
+    assert main(["log", "plot", str(log), "--birds-eye", above, "--time", f"{time_s + 0.03}", "--json"]) == 0
+    assert f'"birds_eye_s": {time_s}' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -99,7 +100,7 @@ def test_the_snapshot_nearest_to_the_time_is_drawn(log, states, tmp_path, capsys
         (["--out", "states.png", "--recording", "-"], "pcm:RATE"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_in_one_line(log, tmp_path, monkeypatch, capsys, options, said):
+def test_wrong_names_of_figures_and_sound_give_one_line(log, tmp_path, monkeypatch, capsys, options, said):
     monkeypatch.chdir(tmp_path)
     assert main(["log", "plot", str(log), *options]) == 2
     assert said in capsys.readouterr().err
@@ -111,7 +112,7 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(log, tmp_path, monkeypatch,
     ids=["run", "run --resume", "run --start 2", "bag"],
 )
 def test_the_sound_is_drawn_on_the_clock_of_its_states(tmp_path, monkeypatch, first_s, last_s, sound_s):
-    """A single click lies where it was heard, two seconds after the first sample."""
+    """A single click, two seconds after the first sample, is drawn at its time."""
     sound = np.random.default_rng(0).normal(0.0, 1e-4, (32_000, 1)) * np.ones(2)
     sound[16_000:16_400] += np.random.default_rng(1).normal(0.0, 0.5, (400, 1))
     soundfile.write(tmp_path / "click.wav", sound, 8000)
@@ -160,19 +161,6 @@ def test_the_true_track_is_drawn_in_line_of_sight_and_out_of_it(panels):
     assert not any("truth" in line.get_label() for line in panels()[0].lines)
 
 
-def test_a_recording_without_truth_has_no_true_track(tmp_path):
-    assert read_true_tracks(tmp_path) == ()
-    (tmp_path / "truth.json").write_text("[1]")
-    with pytest.raises(InputFileError, match="truth"):
-        read_true_tracks(tmp_path)
-
-
-def test_power_is_drawn_where_it_was_heard(panels):
-    sound = SoundPower(TIME_S, np.linspace(-1.5, 1.5, 7), np.ones((40, 7)))
-    edges = np.asarray(panels(sound=sound)[0].collections[0].get_coordinates()[0, :, 0])
-    assert (edges[1:] + edges[:-1]) / 2 == pytest.approx(TIME_S)
-
-
 def test_the_axis_begins_with_the_first_window_on_a_clock_of_1970_too(panels, states):
     late = [replace(state, stamp_ns=state.stamp_ns + 1_700_000_000 * 10**9) for state in states]
     for told in (states, late):
@@ -213,14 +201,73 @@ def test_without_a_budget_no_threshold_is_drawn_and_the_title_says_so(panels, st
     assert "uncalibrated in 1 of" in shown[0].figure.get_suptitle()
 
 
-def test_a_log_without_a_budget_is_summed_up_as_uncalibrated(log, tmp_path, capsys):
-    assert main(["log", "replay", str(log), "--out", str(tmp_path / "again.jsonl")]) == 0
-    assert "uncalibrated" in capsys.readouterr().out
-
-
 def test_no_line_is_drawn_across_a_gap():
     apart = np.column_stack([np.concatenate([TIME_S[2:6], TIME_S[20:30]]), np.ones(14)])
     broken = with_gaps(apart)
     assert np.isnan(broken[4]).all()
     assert np.isfinite(np.delete(broken, 4, axis=0)).all()
     assert np.isfinite(with_gaps(np.column_stack([TIME_S, TIME_S]))).all()
+
+
+MEANINGS = HIDDEN, IN_VIEW, SEARCHED, HEARD, TRUTH, DECISION
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a", "a.jpg"])
+def test_an_unknown_figure_format_raises_an_error_before_drawing(name, tmp_path):
+    with pytest.raises(InputFileError, match=r"\.png, \.svg, \.pdf"), figure_file(tmp_path / name, 3, 2):
+        pytest.fail("drawn")
+    assert not list(tmp_path.iterdir())
+
+
+def test_figures_are_reproducible_and_keep_the_style_of_the_caller(tmp_path):
+    before = dict(mpl.rcParams)
+    for name in ("a.svg", "b.svg"):
+        with figure_file(tmp_path / name, 3, 2) as figure:
+            axes = figure.subplots()
+            axes.plot([1, 2], label="twice")
+            axes.plot([2, 1], label="twice")
+            legend_beside(axes)
+            assert [text.get_text() for text in axes.get_legend().get_texts()] == ["twice"]
+    first, second = ((tmp_path / name).read_text() for name in ("a.svg", "b.svg"))
+    strip = [[line for line in text.splitlines() if "dc:date" not in line] for text in (first, second)]
+    assert strip[0] == strip[1]
+    assert dict(mpl.rcParams) == before
+
+
+def test_a_figure_that_fails_leaves_no_file(tmp_path):
+    with pytest.raises(ZeroDivisionError), figure_file(tmp_path / "a.png", 3, 2):
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
+
+
+# Linear sRGB as seen with protanopia, deuteranopia and tritanopia (Machado et al. 2009), and CIE XYZ.
+SEEN = np.array([
+    np.eye(3),
+    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+])  # fmt: skip
+XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def linear(colour):
+    shown = np.array(mpl.colors.to_rgb(colour))
+    return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+
+
+def lab(seen):
+    share = XYZ @ np.clip(seen, 0.0, 1.0) / XYZ.sum(axis=1)
+    x, y, z = np.where(share > 0.008856, np.cbrt(share), 7.787 * share + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("colours", [MEANINGS, CATEGORIES])
+def test_colours_differ_with_any_colour_vision(colours):
+    for one, other in combinations(colours, 2):
+        apart = [np.linalg.norm(lab(seen @ linear(one)) - lab(seen @ linear(other))) for seen in SEEN]
+        assert min(apart) > 15.0, (one, other)
+
+
+@pytest.mark.parametrize("colour", MEANINGS)
+def test_colours_have_contrast_on_white(colour):
+    assert 1.05 / (XYZ[1] @ linear(colour) + 0.05) > 3.0
