@@ -1,4 +1,4 @@
-"""Tables of a corpus: content, independence of workers and kills, and repeated runs."""
+"""Tables of a corpus: content, independence of workers and kills, repeated runs and shadow hours."""
 
 import json
 import re
@@ -230,9 +230,10 @@ WAYS = {"two processes": {"jobs": 2}, "threads": {"executor": ThreadPoolExecutor
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_tables_do_not_depend_on_the_number_of_workers(way, corpus, options, heard, tmp_path):
-    hear(corpus, tmp_path, **options, **WAYS[way])
-    assert contents(tmp_path) == contents(heard)
+def test_tables_do_not_depend_on_the_workers_and_the_folder(way, corpus, options, heard, tmp_path):
+    shutil.copytree(corpus, tmp_path / "moved")
+    hear(tmp_path / "moved", tmp_path / "out", **options, **WAYS[way])
+    assert contents(tmp_path / "out") == contents(heard)
 
 
 def test_shards_add_up_to_the_whole(corpus, options, heard, tmp_path):
@@ -240,12 +241,6 @@ def test_shards_add_up_to_the_whole(corpus, options, heard, tmp_path):
     names = sorted(one.recording for share in shares for one in share)
     assert names == [one.name for one in find_corpus(corpus)]
     assert contents(tmp_path) == contents(heard)
-
-
-def test_tables_do_not_depend_on_the_folder(corpus, options, heard, tmp_path):
-    shutil.copytree(corpus, tmp_path / "moved")
-    hear(tmp_path / "moved", tmp_path / "out", **options)
-    assert contents(tmp_path / "out") == contents(heard)
 
 
 def test_a_second_run_reads_only_new_and_changed_files(corpus, options, street, tmp_path):
@@ -310,9 +305,11 @@ def test_wrong_manifests_raise_an_error(text, problem, tmp_path):
         find_corpus(tmp_path / "list.csv")
 
 
-def test_wrong_shards_raise_an_error(corpus, options, tmp_path):
+def test_wrong_options_raise_an_error(corpus, options, tmp_path):
     with pytest.raises(InvalidArgumentError, match="shard: expected"):
         hear(corpus, tmp_path, shard=(4, 3), **options)
+    with pytest.raises(InvalidArgumentError, match="cascade: expected it without hops"):
+        hear(corpus, tmp_path, cascade=True, hops=True, **options)
 
 
 def states_of(raised: list[set[str]]) -> list[WorldState]:
@@ -396,16 +393,12 @@ def test_a_cascade_reads_loud_sound_and_its_surroundings(quiet, options, tmp_pat
     assert LEFT_OUT not in hops[whole]
 
 
-def test_the_recall_of_a_cascade_is_measured_on_whole_recordings(quiet, options, tmp_path, capsys):
-    meter = ApproachMeter("a", "")
+def test_the_recall_of_a_cascade_is_measured_on_whole_recordings():
+    meter, kept = ApproachMeter("a", ""), np.arange(21) == 16
     for state in states_of([{"left"} if hop in (50, 150) else set() for hop in range(200)]):
         meter.update(state)
-    kept = np.zeros(21, np.bool_)
-    kept[16] = True
     meter.cascaded(kept, sampled=True)
     assert [(round(one.time_s, 1), one.kept) for one in meter.approaches] == [(5.1, False), (15.1, True)]
-    with pytest.raises(InvalidArgumentError, match="cascade: expected it without hops"):
-        hear(quiet, tmp_path, cascade=True, hops=True, **options)
 
 
 @pytest.mark.long

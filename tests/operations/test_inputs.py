@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from plane_waves import noise_from
 
 from worldstate.adapters.audio.sound_file import RawPcm, open_sound
 from worldstate.adapters.files.array_file import read_array
@@ -37,27 +38,19 @@ def plate(rows: int, columns: int, pitch_m: float, u: int, v: int) -> list[list[
     ]
 
 
-RNG = np.random.default_rng(3)
 OWN = {
     "pair across": line(2, 0.15),
-    "pair along": line(2, 0.15, 0),
     "four in a row": line(4, 0.05),
-    "eight in a row": line(8, 0.2),
     "sixteen along": line(16, 0.04, 0),
     "triangle": ring(3, 0.1),
-    "four on a square": ring(4, 0.5),
     "six on a puck": ring(6, 0.046),
-    "eight on 10 cm": ring(8, 0.05),
     "twelve round the roof": ring(12, 0.8),
     "sixteen on a board": plate(4, 4, 0.042, 1, 2),
     "board on the roof": plate(4, 4, 0.042, 0, 1),
     "board on the door": plate(4, 4, 0.042, 0, 2),
-    "64 in a plate": plate(8, 8, 0.09, 1, 2),
     "four corners of a van": [[4.0, 0.9, 2], [4.0, -0.9, 2], [0, 0.9, 2], [0, -0.9, 2]],
     "tetrahedron": [[0, 0, 0], [0.1, 0, 0], [0.05, 0.09, 0], [0.05, 0.03, 0.08]],
-    "cube": [[x, y, z] for x in (0, 0.2) for y in (0, 0.2) for z in (0, 0.2)],
-    "two rings": ring(8, 0.1) + [[x, y, 1.6] for x, y, _ in ring(8, 0.07)],
-    "32 at random": RNG.uniform(-0.4, 0.4, (32, 3)).tolist(),
+    "32 at random": np.random.default_rng(3).uniform(-0.4, 0.4, (32, 3)).tolist(),
     "tilted plate": [[0.3 * y, y, z] for _, y, z in plate(3, 5, 0.07, 2, 1)],
 }
 FORMS = ("xml", "csv", "json", "txt")
@@ -76,13 +69,8 @@ def write_array(path: Path, positions: list[list[float]]) -> Path:
     return path
 
 
-def wave(array: MicrophoneArray, azimuth_deg: float, duration_s: float = 1.3) -> np.ndarray:
-    """Return white noise from one direction with some independent noise per microphone."""
-    n = round(RATE * duration_s)
-    spectrum = np.fft.rfft(np.random.default_rng(0).normal(0, 0.1, n))
-    delays = array.delays_s(math.radians(azimuth_deg))
-    turned = spectrum[:, None] * np.exp(-2j * np.pi * np.fft.rfftfreq(n, 1 / RATE)[:, None] * delays)
-    return np.fft.irfft(turned, n, axis=0) + np.random.default_rng(1).normal(0, 0.01, (n, len(delays)))
+def wave(array: MicrophoneArray, azimuth_deg: float) -> np.ndarray:
+    return 0.1 * noise_from(array, math.radians(azimuth_deg), RATE, 1.3)
 
 
 def rows_of(path: Path) -> np.ndarray:

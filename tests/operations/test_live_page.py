@@ -215,49 +215,41 @@ def test_sound_without_a_visible_vehicle_is_a_reflection(states):
 def test_a_browser_shows_the_run_without_an_error(states, tmp_path):
     shown = "[...document.querySelectorAll('#health span')].map(one => one.textContent)"
     width = "document.documentElement.scrollWidth <= innerWidth"
-    with LivePage(0) as page, browser(tmp_path / "profile") as seen:
-        seen.open(page.url)
-        for k, state in enumerate(states):
-            page.show(hop(state, overruns=k, lost_s=0.1 * k))
-        seen.until(f"rows?.length === {len(states)}")
-        for pixels in (1300, 420):
-            for scheme in ("light", "dark"):
-                screen = {"width": pixels, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-                seen.call("Emulation.setDeviceMetricsOverride", **screen)
-                media = [{"name": "prefers-color-scheme", "value": scheme}]
-                seen.call("Emulation.setEmulatedMedia", features=media)
-                page.show(hop(replace(states[-1], stamp_ns=states[-1].stamp_ns + 10**8)))
-                assert seen.value("innerWidth") == pixels
-                assert seen.value(width)
-                ground = seen.value("getComputedStyle(document.body).backgroundColor")
-                assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 23, 26)"}[scheme]
-        assert seen.value("at('sentence').textContent") == headline(states[-1])
-        seen.until(f"rows.length === {len(states) + 4}")
-        assert "40 ms behind the sound" in seen.value(shown)
-        texts = "[...document.querySelectorAll('#cameras svg text:not(.muted)')]"
-        boxes = seen.value(f"{texts}.map(one => one.textContent)")
-        assert boxes == ["car 0.90", "</script><b> 0.50, parked"]
-        assert "camera: 2 boxes" in seen.value("at('cameras').textContent")
-        # The view to the left is on the left.
-        drawn = "[...document.querySelectorAll('#cameras rect')].slice(1)"
-        lefts = seen.value(f"{drawn}.map(one => +one.getAttribute('x'))")
-        assert lefts[0] < lefts[1]
-        # The selected time stays while hops continue, until the page follows again.
-        seen.press("Home")
-        page.show(hop(replace(states[-1], stamp_ns=states[-1].stamp_ns + 2 * 10**8)))
-        seen.until(f"rows.length === {len(states) + 5}")
-        assert seen.value("at('time').textContent") == f"{states[0].stamp_ns / 1e9:.2f} s"
-        seen.press(" ")
-        assert seen.value("+at('slider').value") == len(states) + 4
-        assert [url for url in seen.asked() if not url.startswith("data:")] == [page.url]
-        assert not seen.faults()
-
-
-@pytest.mark.long
-@needs_browser
-def test_a_browser_shows_the_end_of_the_run(tmp_path):
     with browser(tmp_path / "profile") as seen:
         with LivePage(0) as page:
             seen.open(page.url)
+            for k, state in enumerate(states):
+                page.show(hop(state, overruns=k, lost_s=0.1 * k))
+            seen.until(f"rows?.length === {len(states)}")
+            for pixels in (1300, 420):
+                for scheme in ("light", "dark"):
+                    screen = {"width": pixels, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+                    seen.call("Emulation.setDeviceMetricsOverride", **screen)
+                    media = [{"name": "prefers-color-scheme", "value": scheme}]
+                    seen.call("Emulation.setEmulatedMedia", features=media)
+                    page.show(hop(replace(states[-1], stamp_ns=states[-1].stamp_ns + 10**8)))
+                    assert seen.value("innerWidth") == pixels
+                    assert seen.value(width)
+                    ground = seen.value("getComputedStyle(document.body).backgroundColor")
+                    assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 23, 26)"}[scheme]
+            assert seen.value("at('sentence').textContent") == headline(states[-1])
+            seen.until(f"rows.length === {len(states) + 4}")
+            assert "40 ms behind the sound" in seen.value(shown)
+            texts = "[...document.querySelectorAll('#cameras svg text:not(.muted)')]"
+            boxes = seen.value(f"{texts}.map(one => one.textContent)")
+            assert boxes == ["car 0.90", "</script><b> 0.50, parked"]
+            assert "camera: 2 boxes" in seen.value("at('cameras').textContent")
+            # The view to the left is on the left.
+            drawn = "[...document.querySelectorAll('#cameras rect')].slice(1)"
+            lefts = seen.value(f"{drawn}.map(one => +one.getAttribute('x'))")
+            assert lefts[0] < lefts[1]
+            # The selected time stays while hops continue, until the page follows again.
+            seen.press("Home")
+            page.show(hop(replace(states[-1], stamp_ns=states[-1].stamp_ns + 2 * 10**8)))
+            seen.until(f"rows.length === {len(states) + 5}")
+            assert seen.value("at('time').textContent") == f"{states[0].stamp_ns / 1e9:.2f} s"
+            seen.press(" ")
+            assert seen.value("+at('slider').value") == len(states) + 4
+            assert [url for url in seen.asked() if not url.startswith("data:")] == [page.url]
         seen.until("at('remarks').textContent.includes('The run has ended')")
         assert not seen.faults()
