@@ -8,7 +8,6 @@ import pytest
 import soundfile
 from plane_waves import array_check
 
-from worldstate.adapters.audio.sound_file import SilentChannelsError, open_audio
 from worldstate.adapters.files.array_file import write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import roof_array_56
@@ -105,15 +104,3 @@ def test_run_leaves_silent_channels_out_with_a_warning(street, silent, tmp_path,
     assert main(["run", str(path), "--array", str(tmp_path / "mics.xml"), "--uncalibrated", "--json"]) == 0
     assert ("channel 7, 10 is silent" in caplog.text) == bool(silent)
     assert json.loads(capsys.readouterr().out)["masked_microphones"] == [one + 1 for one in silent]
-
-
-def test_open_audio_lists_silent_channels(tmp_path: Path) -> None:
-    samples = np.random.default_rng(0).uniform(-0.5, 0.5, (9000, 4))
-    samples[:, [0, 2]] = [0.0, 0.25]
-    soundfile.write(tmp_path / "a.wav", samples, 8000)
-    with pytest.raises(SilentChannelsError) as refused:
-        open_audio(tmp_path / "a.wav")
-    assert refused.value.channels == (1, 3)
-    with open_audio(tmp_path / "a.wav", strict=False) as source:
-        assert source.silent_channels == (1, 3)
-        assert len(np.concatenate(list(source.blocks(1000)))) == 9000

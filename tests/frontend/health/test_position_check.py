@@ -164,12 +164,10 @@ def waves(positions: np.ndarray, azimuths_deg: tuple[float, ...]) -> np.ndarray:
 HEXAGON = ring(6, 0.0463)
 
 
-@pytest.mark.parametrize("claimed", [0.02, None], ids=["centimetres off", "in another order"])
-def test_talkers_in_a_live_room_give_the_positions(claimed: float | None) -> None:
+def test_talkers_in_a_live_room_give_positions_that_are_centimetres_off() -> None:
     """A plain descent from positions that are 20 mm off ends 86 mm off."""
     sound = room(HEXAGON, tuple(range(0, 360, 60)), seed=1)
-    noise = np.random.default_rng(3).standard_normal((6, 3)) * [1.0, 1.0, 0.0]
-    given = HEXAGON[[3, 0, 4, 1, 5, 2]] if claimed is None else HEXAGON + claimed * noise
+    given = HEXAGON + 0.02 * np.random.default_rng(3).standard_normal((6, 3)) * [1.0, 1.0, 0.0]
     found = fitted([sound], given)
     assert error_m(found.positions_m, HEXAGON) < 0.005 < 0.05 < error_m(given, HEXAGON)
 
