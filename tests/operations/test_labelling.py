@@ -8,18 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import soundfile
-from matplotlib.figure import Figure
 from passing_boxes import CAMERA, EDGE_RAD, LANE_M, passing
 
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
-from worldstate.adapters.datasets.ovad import TrueTrack
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, MissingExtraError, SchemaVersionError
 from worldstate.operations.labelling.label_files import file_below, open_label, pass_windows
 from worldstate.operations.labelling.pass_labels import BoxTrack, box_tracks, label_passes
-from worldstate.operations.labelling.street_figure import draw_passes
 from worldstate.operations.labelling.street_passes import (
     HeardStreet,
     read_street,
@@ -133,18 +130,6 @@ def test_windows_exclude_two_vehicles_and_busy_seconds(labelled):
     for end_s in by_class["none"]:
         assert all(not -1.0 <= t0_s(start, 5.0) - end_s <= 5.0 for start, _ in starts)
     assert by_class["none"]
-
-
-def test_the_true_track_is_drawn_for_the_time_of_the_pass(labelled):
-    starts, _, passes = labelled
-    time_s = np.arange(0.0, 40.0, 0.1)
-    places = np.stack([np.full(400, LANE_M), 20.0 - 5.0 * (time_s - starts[2][0])], axis=1)
-    truth = TrueTrack(time_s, np.arctan2(*places.T[::-1]), time_s > t0_s(starts[2][0], 5.0), places)
-    axes = Figure().add_subplot()
-    draw_passes(axes, passes, [truth])
-    (true,) = [line for line in axes.get_lines() if line.get_label() == "truth"]
-    ends_s = passes[2].track.time_s[[0, -1]]
-    assert true.get_xdata()[[0, -1]] == pytest.approx(np.interp(ends_s, time_s, places[:, 1]), abs=0.5)
 
 
 def test_a_list_of_labels_is_beside_or_above_its_recording(tmp_path):

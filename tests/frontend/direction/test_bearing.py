@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plane_waves import noise_from, plane_wave
-from scipy.signal import ShortTimeFFT
 
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array, roof_array_56
 from worldstate.frontend.array.steering import Steering
@@ -235,17 +234,6 @@ def test_variance_meets_the_bound(snr):
     sampling_db = 10 * np.log10(1 - 3.0 * np.sqrt(2 / trials))
     assert sampling_db < ratio_db < 1.5
     assert abs(np.mean(errors)) < 4 * np.sqrt(bound / trials)
-
-
-def test_delay_of_a_stream_through_a_windowed_stft():
-    rng = np.random.default_rng(6)
-    sound, rate = rng.normal(size=48_000), 48_000
-    pair = np.stack([sound[100:-100], sound[93:-107]], axis=-1)  # the second hears everything 7 samples later
-    stft = ShortTimeFFT(np.hanning(512), 256, rate)
-    X = np.moveaxis(stft.stft(pair, axis=0), (0, 1, 2), (1, 2, 0))
-    band = (stft.f > 300) & (stft.f < 1800)
-    late = gcc_delays(X[:, band], stft.f[band], 1e-3)
-    assert late.delay_s[0] == pytest.approx(-7 / rate, abs=0.02 / rate)
 
 
 def test_a_dead_microphone_has_no_peak():

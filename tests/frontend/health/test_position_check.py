@@ -7,7 +7,7 @@ import numpy as np
 import pyroomacoustics as pra
 import pytest
 import soundfile
-from plane_waves import plane_wave, position_check
+from plane_waves import array_check, plane_wave, position_check
 
 from worldstate.adapters.files.array_file import read_array
 from worldstate.cli.main import main
@@ -90,27 +90,28 @@ def test_silence_and_independent_noise_allow_no_conclusion(sound: np.ndarray) ->
     assert "coherent sound" in found.unjudged[0]
 
 
-def run(folder: Path, sound: np.ndarray, positions: np.ndarray, *options: str) -> int:
-    soundfile.write(folder / "some.wav", sound, RATE, subtype="PCM_24")
-    (folder / "mics.json").write_text(json.dumps(positions.tolist()))
-    return main(["array", "check", str(folder / "some.wav"), "--array", str(folder / "mics.json"), *options])
+def checked(folder: Path, sound: np.ndarray, positions: np.ndarray, *options: str) -> int:
+    return array_check(folder, MicrophoneArray(positions), sound, RATE, *options)
 
 
 def test_the_command(talkers: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(tmp_path, talkers, ring(6, 0.045)) == 0
+    assert checked(tmp_path, talkers, ring(6, 0.045)) == 0
     assert "mirrored or rotated" in capsys.readouterr().out
-    assert run(tmp_path, talkers, ring(6, 0.045)[[1, 0, 2, 3, 4, 5]], "--json") == 1
+    assert checked(tmp_path, talkers, ring(6, 0.045)[[1, 0, 2, 3, 4, 5]], "--json") == 1
     report = json.loads(capsys.readouterr().out)
     assert report["condition"] == "impaired"
     assert not report["positions"]["fit"]
     limit = float(talkers.std())
-    assert run(tmp_path, talkers.clip(-limit, limit), ring(6, 0.045)) == 1
+    assert checked(tmp_path, talkers.clip(-limit, limit), ring(6, 0.045)) == 1
     assert "not healthy: clipped 1, 2, 3, 4, 5, 6" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("divisor", [39.37, 25.0])
 def test_an_array_too_small_is_refused_with_its_unit(talkers, tmp_path, capsys, divisor):
-    assert run(tmp_path, talkers, ring(6, 0.045) / divisor) == 2
+    sound, array = tmp_path / "some.wav", tmp_path / "mics.json"
+    soundfile.write(sound, talkers, RATE)
+    array.write_text(json.dumps((ring(6, 0.045) / divisor).tolist()))
+    assert main(["array", "check", str(sound), "--array", str(array)]) == 2
     assert "inches" in capsys.readouterr().err
 
 
@@ -220,7 +221,7 @@ def test_insufficient_waves_raise_an_error(around: list[np.ndarray]) -> None:
 def test_the_command_writes_an_array_file(around, tmp_path, capsys):
     soundfile.write(tmp_path / "other.wav", around[1], RATE, subtype="PCM_24")
     options = ("--fit", str(tmp_path / "fitted.xml"), "--also", str(tmp_path / "other.wav"))
-    run(tmp_path, around[0], 1.4 * SQUARE, *options)
+    checked(tmp_path, around[0], 1.4 * SQUARE, *options)
     printed = capsys.readouterr().out
     assert "of the coherent sound, those given" in printed
     table = [line for line in printed.splitlines() if line.count(",") == 2 and line[:1] in "x-0"]
@@ -229,11 +230,11 @@ def test_the_command_writes_an_array_file(around, tmp_path, capsys):
     np.testing.assert_array_equal(read_array(tmp_path / "pasted.csv").positions_m, written)
     assert "not determined: z: 0.77 or 1.3 times" in printed
     assert error_m(read_array(tmp_path / "fitted.xml").positions_m, SQUARE) < 0.004
-    assert run(tmp_path, around[0], 1.4 * SQUARE, "--fit") == 1
+    assert checked(tmp_path, around[0], 1.4 * SQUARE, "--fit") == 1
     assert "\nx,y,z\n" in capsys.readouterr().out
-    assert run(tmp_path, around[0], SQUARE, "--fit", str(tmp_path / "fitted.txt")) == 2
+    assert checked(tmp_path, around[0], SQUARE, "--fit", str(tmp_path / "fitted.txt")) == 2
     assert "ends in .csv or .xml" in capsys.readouterr().err
-    assert run(tmp_path, around[0], SQUARE, "--also", "other.wav") == 2
+    assert checked(tmp_path, around[0], SQUARE, "--also", "other.wav") == 2
     assert "expected --fit" in capsys.readouterr().err
 
 
