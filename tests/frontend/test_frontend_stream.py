@@ -88,9 +88,7 @@ def test_several_sources_are_several_peaks() -> None:
     found = sorted(np.degrees(peak.azimuth_rad) for peak in frame.peaks[:3])
     np.testing.assert_allclose(found, truth_deg, atol=2.5)
     assert frame.peaks[0].azimuth_rad == frame.bearing_rad
-    assert frame.peaks[0].prominence == frame.prominence
     assert sorted(frame.peaks, key=lambda peak: -peak.value) == list(frame.peaks)
-    assert len(frame.peaks) <= 4
 
 
 def test_band_levels_of_white_noise_and_a_tone() -> None:

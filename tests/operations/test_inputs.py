@@ -13,7 +13,7 @@ import soundfile
 from plane_waves import noise_from
 
 from worldstate.adapters.audio.sound_file import RawPcm, open_sound
-from worldstate.adapters.files.array_file import read_array
+from worldstate.adapters.files.array_file import read_array, write_array_xml
 from worldstate.cli.main import main
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.frontend.stream import FrontEnd
@@ -58,8 +58,7 @@ FORMS = ("xml", "csv", "json", "txt")
 
 def write_array(path: Path, positions: list[list[float]]) -> Path:
     if path.suffix == ".xml":
-        rows = "".join(f'<pos Name="{i}" x="{-y}" y="{z}" z="{x}"/>' for i, (x, y, z) in enumerate(positions))
-        path.write_text(f"<MicArray>{rows}</MicArray>")
+        write_array_xml(path, MicrophoneArray(positions))
     elif path.suffix == ".json":
         path.write_text(json.dumps({"positions_m": positions}))
     else:

@@ -20,7 +20,6 @@ from worldstate.adapters.export.log_messages import image_message, mcap_file, so
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement.measurement import Bearing
-from worldstate.operations import figure_style
 from worldstate.operations.viewing import log_page
 from worldstate.operations.viewing.log_page import page_data, write_log_page
 
@@ -116,12 +115,6 @@ def test_a_long_log_is_thinned_with_a_note(states, monkeypatch):
     data = page_data(many)
     assert [row["t"] for row in data["states"]] == pytest.approx(np.arange(0.0, 9.0, 0.8))
     assert "One of 8 snapshots is shown of 90" in data["remarks"][-1]
-
-
-def test_page_and_figures_have_the_same_colours(states, tmp_path):
-    light = dict(re.findall(r"--(\w+): (#\w+);", written(states, tmp_path).split("prefers-color-scheme")[0]))
-    for name in ("HIDDEN", "IN_VIEW", "SEARCHED", "HEARD", "DECISION"):
-        assert light[name.lower().removeprefix("in_")] == getattr(figure_style, name).lower()
 
 
 def test_the_view_command_writes_a_part_of_a_log(states, tmp_path, capsys):

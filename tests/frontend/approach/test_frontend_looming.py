@@ -24,15 +24,10 @@ def direct_approach(range_m: float, closing_m_s: float) -> np.ndarray:
 @given(st.floats(2.0, 80.0), st.floats(-15.0, 15.0), st.floats(-30.0, 30.0))
 def test_looming_is_exact_at_constant_speed_and_any_level(range_m, closing_m_s, level):
     assume(range_m + closing_m_s > 1.0)
-    found = looming(TIMES_S, direct_approach(range_m, closing_m_s) + level, floor_std=1e-4)
+    energies = direct_approach(range_m, closing_m_s) + level
+    found = looming(TIMES_S, energies, floor_std=1e-4)
     assert found.inverse_tta_hz == pytest.approx(closing_m_s / range_m, rel=1e-6, abs=1e-9)
-
-
-@given(st.floats(20.0, 80.0), st.floats(1.0, 15.0))
-def test_log_slope_is_two_over_tta_near_the_middle(range_m: float, closing_m_s: float) -> None:
-    found = looming(TIMES_S, direct_approach(range_m, closing_m_s), floor_std=1e-4)
-    middle = 2 * closing_m_s / (range_m + 0.5 * closing_m_s)
-    assert found.log_slope_hz == pytest.approx(middle, rel=0.02)
+    assert found.log_slope_hz == pytest.approx(np.polyfit(TIMES_S, energies, 1)[0], abs=1e-9)
 
 
 def test_standard_errors_match_the_errors() -> None:

@@ -157,15 +157,9 @@ def test_blocks_of_any_length_give_the_same_states_across_a_checkpoint():
     pieces += [state for block in rest for state in other.push(block)]
     # The last hop of the sound has no spectrum.
     assert len(whole) == 13 and pieces == whole
-
-
-def test_unmeasured_hearing_is_null():
-    rng = np.random.default_rng(7)
-    spectra = GivenSpectra(rng.uniform(0.1, 0.3, (15, 180)), LEFT_POSITIVE_RAD, SEVEN)
-    states = Listener(ovad_array(), GIVEN_HZ, spectra=spectra).push(at_seven(0.5, 7)[:, :1])
-    assert states[-1].heard is None and not states[-1].calibrated
-    assert states[-1].to_dict()["heard"] is None
-    assert all(cue.alpha is None for cue in states[-1].cues)
+    # The usable share is not measured, so it is null.
+    assert whole[-1].to_dict()["heard"] is None and not whole[-1].calibrated
+    assert all(cue.alpha is None for cue in whole[-1].cues)
 
 
 def test_rows_of_half_a_window_count_at_their_end():

@@ -16,7 +16,6 @@ from worldstate.frontend.health.channel_health import ArrayHealth, ChannelFault
 from worldstate.frontend.stream import FrontEnd
 from worldstate.ground.values import NotUsable
 from worldstate.operations.recordings.channel_report import ChannelVerdict, HealthLog
-from worldstate.simulation import draw_settings, simulate_recording
 
 RATE = 16_000
 ROOF = roof_array_56()
@@ -128,19 +127,6 @@ def test_a_clean_street_raises_no_alarm(seed: int, levels: int | None) -> None:
     if levels is not None:
         sound = np.round(sound * levels).astype(np.float32)
     assert all(health.is_healthy for health in healths(array, sound))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("approach", "seed"), [("left", 5), ("none", 6)])
-def test_simulated_junctions_raise_no_alarm_and_show_a_swap(approach: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    recording = simulate_recording(draw_settings("SB1", approach, rng, duration_s=2.2), rng, ROOF)
-    found = healths(ROOF, recording.audio, recording.sample_rate_hz)
-    assert all(health.is_healthy for health in found)
-    assert isinstance(found[-1].coherence, float)
-    swapped = recording.audio.copy()
-    swapped[:, [3, 40]] = recording.audio[:, [40, 3]]
-    assert named(healths(ROOF, swapped, recording.sample_rate_hz)[-1].faults) == {"swapped": {3, 40}}
 
 
 def test_independent_noise_is_not_classified() -> None:
