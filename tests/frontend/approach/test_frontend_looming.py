@@ -101,24 +101,16 @@ def test_looming_has_a_larger_error_at_the_start_of_a_stream() -> None:
     assert abs(cold.inverse_tta_hz - 0.5) < 2.0 * cold.std_hz
 
 
-@pytest.mark.parametrize(
-    ("step", "seconds", "seed"),
-    [
-        pytest.param(4, 2.0, 1, id="14"),
-        pytest.param(2, 3.0, 2, id="28", marks=pytest.mark.slow),
-        pytest.param(1, 3.0, 3, id="all 56", marks=pytest.mark.slow),
-    ],
-)
-def test_bearing_of_a_pass_by(step: int, seconds: float, seed: int) -> None:
+def test_bearing_of_a_pass_by() -> None:
     """Errors against where the source was when what is heard now left it."""
-    array, errors = MicrophoneArray(roof_array_56().positions_m[::step]), []
-    sound = render(array, pass_by, seconds, seed)
+    array, errors = MicrophoneArray(roof_array_56().positions_m[::4]), []
+    sound = render(array, pass_by, 2.0, seed=1)
     sound += 0.02 * np.random.default_rng(0).standard_normal(sound.shape)
     for frame in FrontEnd(array, RATE).process(sound):
         place = heard_at(pass_by, frame.sample_index / RATE - frame.bearing_age_s)
         x, y, _ = place - array.positions_m.mean(axis=0)
         errors.append(np.degrees(frame.bearing_rad - np.arctan2(y, x)))
-    assert len(errors) >= 10 * (seconds - 1.0)
+    assert len(errors) >= 10
     assert np.sqrt(np.mean(np.square(errors))) <= 0.5
     assert np.median(np.abs(errors)) <= 0.3
 

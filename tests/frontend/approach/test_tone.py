@@ -22,6 +22,10 @@ BOTH = ChannelMask.all_of(2)
 SETTINGS = FrontEndSettings(tone_band_hz=(20.0, 400.0))
 
 
+def line(frequency_hz: float, seconds: float, rate: float, phase: float = 0.3) -> np.ndarray:
+    return np.cos(2 * np.pi * frequency_hz / rate * np.arange(round(seconds * rate)) + phase)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     frequency=st.floats(10.0, 490.0),
@@ -30,8 +34,7 @@ SETTINGS = FrontEndSettings(tone_band_hz=(20.0, 400.0))
     n=st.integers(200, 400),
 )
 def test_noiseless_real_tone_is_exact(frequency, phase, amplitude, n):
-    t = np.arange(n) / SAMPLES_HZ
-    tone = estimate_tone(amplitude * np.cos(2 * np.pi * frequency * t + phase), SAMPLES_HZ)
+    tone = estimate_tone(amplitude * line(frequency, n / SAMPLES_HZ, SAMPLES_HZ, phase), SAMPLES_HZ)
     assert tone.frequency_hz == pytest.approx(frequency, rel=1e-8)
     assert tone.amplitude == pytest.approx(amplitude, rel=1e-6)
     assert np.exp(1j * tone.phase_rad) == pytest.approx(np.exp(1j * phase), abs=1e-5)
@@ -52,14 +55,9 @@ def test_real_estimate_is_the_least_squares_optimum():
 
 
 def test_the_strongest_tone_is_found_and_an_offset_is_none():
-    t = np.arange(500) / SAMPLES_HZ
-    y, other = np.cos(2 * np.pi * 80 * t), np.cos(2 * np.pi * 200.3 * t)
+    y, other = (line(frequency, 0.5, SAMPLES_HZ) for frequency in (80.0, 200.3))
     assert estimate_tone(5 * y + other, SAMPLES_HZ).frequency_hz == pytest.approx(80, abs=0.05)
     assert estimate_tone(0.1 + y, SAMPLES_HZ).frequency_hz == pytest.approx(80, abs=0.01)
-
-
-def line(frequency_hz: float, seconds: float, rate: float, phase: float = 0.3) -> np.ndarray:
-    return np.cos(2 * np.pi * frequency_hz / rate * np.arange(round(seconds * rate)) + phase)
 
 
 def read(sound: np.ndarray, rate: float, array: MicrophoneArray = PAIR, keep=(True, True)):
@@ -201,10 +199,10 @@ def test_variance_of_samples_meets_the_bound(snr_db):
     """Within 1.5 dB of eq. (9) of Rife and Boorstyn, never below it beyond three standard errors."""
     rng = np.random.default_rng(int(snr_db) + 4)
     n, trials, eta = 256, 800, 10 ** (snr_db / 10)
-    t, errors, claimed, found = np.arange(n) / SAMPLES_HZ, [], [], []
+    errors, claimed, found = [], [], []
     for _ in range(trials):
-        frequency, phase = rng.uniform(40, 460), rng.uniform(-np.pi, np.pi)
-        wave = np.cos(2 * np.pi * frequency * t + phase)
+        frequency = rng.uniform(40, 460)
+        wave = line(frequency, n / SAMPLES_HZ, SAMPLES_HZ, rng.uniform(-np.pi, np.pi))
         tone = estimate_tone(wave + rng.normal(size=n) * np.sqrt(1 / (2 * eta)), SAMPLES_HZ)
         errors.append(tone.frequency_hz - frequency)
         claimed.append(tone.frequency_std_hz**2)

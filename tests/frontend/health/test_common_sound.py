@@ -162,7 +162,6 @@ CROSSED = {
     "half of them 30 ms late": lambda x, rng: np.concatenate([x[180:, ::2], x[:-180, 1::2]], axis=1),
     "each later, up to 1 s": lambda x, rng: np.array([np.roll(c, rng.integers(60, 6000)) for c in x.T]).T,
     "every other inverted": lambda x, rng: x * np.where(np.arange(x.shape[1]) % 2, -1.0, 1.0),
-    "16 bits read as 32": lambda x, rng: _bits(x, "<i2").view("<i4").reshape(-1, x.shape[1]),
     "a sample of one channel lost": lambda x, rng: x.reshape(-1)[1 : 1 - x.shape[1]].reshape(-1, x.shape[1]),
 }
 SPREAD = {
@@ -170,11 +169,6 @@ SPREAD = {
     "12 anywhere": np.random.default_rng(3).uniform(-0.4, 0.4, (12, 3)) * [0.7, 1.0, 0.3],
     "7 anywhere": np.random.default_rng(4).uniform(-0.1, 0.1, (7, 3)),
 }
-
-
-def _bits(sound: np.ndarray, kind: str) -> np.ndarray:
-    whole = sound[: len(sound) // 4 * 4] * (0.3 * 2**15 / np.abs(sound).max())
-    return np.round(whole).astype(kind).reshape(-1)
 
 
 @pytest.fixture(scope="module", params=["SA1", "TB2"])
