@@ -1,24 +1,23 @@
 """The acoustic adapter combines sound, camera and signature at one stamp, with a guard and road users."""
 
-from collections.abc import Collection
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from camera_boxes import EMPTY, boxed
+from camera_boxes import EMPTY, boxed, crossing
 from made_up_sound import Fixed, plane_wave
-from street_measurements import after
+from street_measurements import after, run
 
 from worldstate import MicrophoneArray, NotUsable, WorldFilter, WorldState
 from worldstate.abduction import DomainGuard, Familiar, Foreign
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present, Unqueried
+from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.road_users import RoadUserModel, WarningSignal, expected_labels, heard_kinds
 from worldstate.adapters import DetectionFilter, DetectionLog, PinholeCamera, VisionQuery, acoustic
 from worldstate.adapters.acoustic import FOREIGN, AcousticAdapter, asked_again
-from worldstate.belief.street_model import StreetModel
-from worldstate.belief.track import Tracks, heard_as
+from worldstate.adapters.camera.detections import DetectionFrame
 from worldstate.frontend.direction.feature import feature_nfft
 from worldstate.frontend.settings import FrontEndSettings
 from worldstate.frontend.spectra.sound_character import BANDS, MEASURES
@@ -249,47 +248,26 @@ def coloured(deep: bool) -> np.ndarray:
     return np.asarray(0.02 * np.fft.irfft(spectrum * tilt[:, None], len(noise), axis=0), np.float32)
 
 
-class Asked:
-    """A channel that records its queries."""
-
-    def __init__(self) -> None:
-        self.labels: list[Collection[str] | None] = []
-
-    def ask(self, stamp_ns: int, bearing: object, labels: Any = None, side: object = None) -> CoEvidence:
-        self.labels.append(labels)
-        return Absent(0.1)
-
-    def sightings(self, stamp_ns: int) -> tuple[()]:
-        return ()
-
-    def last_look(self, stamp_ns: int) -> None:
-        return None
+def watched(frames: Iterable[DetectionFrame]) -> VisionQuery:
+    keep = DetectionFilter(frozenset({"car", "truck"}))
+    return VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate(frames, 10.0), keep=keep)
 
 
-@pytest.mark.parametrize(
-    ("deep", "name", "labels"), [(True, "truck", {"truck", "bus"}), (False, "car", {"car"})]
-)
-def test_the_acoustic_kind_sets_the_camera_query_and_the_entity(deep, name, labels) -> None:
-    asked = Asked()
-    found = unwatched(SURE, asked, road_users=by_colour()).measure(coloured(deep))
-    assert [one.kinds for one in found[:11]] == [()] * 11
-    assert asked.labels[:11] == [None] * 11
+@pytest.mark.parametrize(("deep", "name", "answer"), [(True, "truck", Present), (False, "car", Absent)])
+def test_the_acoustic_kind_sets_the_camera_query_and_the_entity(deep, name, answer) -> None:
+    truck = watched(crossing(300.0, 10.0, label="truck").frames)
+    found = unwatched(SURE, truck, road_users=by_colour()).measure(coloured(deep))
+    # Before a kind is heard, any class counts.
+    assert [(one.kinds, type(one.co_evidence)) for one in found[:11]] == [((), Present)] * 11
     assert max(found[-1].kinds, key=lambda one: one[1])[0] == name
-    asked_again(found[-1], asked)
-    assert asked.labels[-2:] == [labels, labels]
-    world, said = WorldFilter(), []
-    for one in found:
-        world = world.update(one)
-        (entity,) = world.state.entities
-        said.append({kind.label: kind.probability for kind in entity.classification})
-        assert sum(said[-1].values()) <= 1.0 + 1e-9
-    assert said[0] == {"unknown": 1.0}
-    assert said[-1][name] > 0.8
-    # After a detection the label of the detector is kept.
-    assert world.memory is not None
-    (track,) = world.memory.tracks.rows()
-    seen = Tracks.of([replace(track, last_seen_ns=1, labels=(("car", 0.9),))])
-    assert heard_as(seen, 0, found[-1].kinds, StreetModel()) == (("car", 0.9),)
+    for last in (found[-1], asked_again(found[-1], truck)):
+        assert isinstance(last.co_evidence, answer)
+    (seen,) = (one for one in after(*found).state.entities if one.status == "visible")
+    assert seen.classification[0].label == "truck", "the label of the detector is kept"
+    worlds = run(WorldFilter(), unwatched(SURE, road_users=by_colour()).measure(coloured(deep)))
+    said = [{kind.label: kind.probability for kind in one.state.entities[0].classification} for one in worlds]
+    assert said[0] == {"unknown": 1.0} and said[-1][name] > 0.8
+    assert all(sum(one.values()) <= 1.0 + 1e-9 for one in said)
 
 
 def test_a_foreign_sound_has_no_kind_and_a_siren_its_own() -> None:
@@ -300,19 +278,16 @@ def test_a_foreign_sound_has_no_kind_and_a_siren_its_own() -> None:
     assert "siren" not in dict(heard_kinds(model, silence, WarningSignal("horn", 9.0)))
 
 
-def query(*labels: str) -> VisionQuery:
-    """Return a camera with earlier detections of these classes and an empty image now."""
-    frames = [boxed((600.0, 300.0, 800.0, 600.0), label=one) for one in labels]
-    keep = DetectionFilter(frozenset({"car", "truck"}))
-    return VisionQuery(PinholeCamera.ovad(), DetectionLog.at_rate([*frames, EMPTY], 10.0), keep=keep)
-
-
 def test_an_excluded_class_raises_the_miss_rate_or_is_unqueried() -> None:
-    ask = partial(query("car", "truck").ask, 200_000_000, Bearing(0.0, 0.05))
+    """Earlier images show classes of the detector, and the one now is empty."""
+    car_px, at = (600.0, 300.0, 800.0, 600.0), (200_000_000, Bearing(0.0, 0.05))
+    ask, one = (
+        partial(watched([boxed(car_px), boxed(car_px, label=other), EMPTY]).ask, *at)
+        for other in ("truck", "car")
+    )
     car, either = ask({"car"}), ask({"car", "bus"})
     assert isinstance(car, Absent) and isinstance(either, Absent)
     assert either.miss_rate == pytest.approx(0.5 * (1.0 + car.miss_rate))
     assert isinstance(ask({"bicycle"}), Unqueried)
     # A detector with one class is queried for any class.
-    one = partial(query("car", "car").ask, 200_000_000, Bearing(0.0, 0.05))
     assert one({"truck"}) == one() != ask({"train"})
