@@ -11,6 +11,7 @@ import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_sound import plane_wave
+from scipy.spatial.transform import Rotation
 from worldstate_lab.cli.main import main as study
 
 from worldstate import Context, MicrophoneArray, Odometry
@@ -31,16 +32,9 @@ from worldstate.measurement.measurement import Bearing
 from worldstate.state.world_state import why_not
 
 RATE = 47_998
-HERE = ovad_array().positions_m
+HERE = np.array(ovad_array().positions_m)
 RNG = np.random.default_rng(10)
 SHUFFLED, EIGHT = HERE[RNG.permutation(56)], MicrophoneArray(HERE[:8], "eight")
-
-
-def turned(degrees: float, axis: int) -> np.ndarray:
-    angle, (i, j) = np.radians(degrees), [other for other in range(3) if other != axis]
-    turn = np.eye(3)
-    turn[[i, i, j, j], [i, j, i, j]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
-    return HERE @ turn.T
 
 
 WRONG = {
@@ -48,25 +42,20 @@ WRONG = {
     "y and z swapped": (HERE[:, [0, 2, 1]], "axes swapped"),
     "in the file's axes": (np.stack([-HERE[:, 1], HERE[:, 2], HERE[:, 0]], 1), "axes swapped"),
     "millimetres": (1e3 * HERE, "looks like millimetres"),
-    "centimetres": (1e2 * HERE, "looks like centimetres"),
     "mirrored": (HERE * [1, -1, 1], "looks mirrored"),
-    "upside down": (HERE * [1, 1, -1], "looks mirrored"),
     "half a turn": (HERE * [1, -1, -1], "looks turned by half a turn"),
     "one missing": (HERE[1:], "55 microphones, expected 56"),
-    "one too many": (np.vstack([HERE, [0, 1, 0]]), "57 microphones, expected 56"),
     "another array": (roof_array_56().positions_m, "elsewhere"),
-    "noise of 5 cm": (HERE + 0.05 * RNG.standard_normal(HERE.shape), "elsewhere"),
     "noise of 5 mm": (HERE + 0.005 * RNG.standard_normal(HERE.shape), "elsewhere"),
     "scaled": (0.5 * HERE, "looks scaled by 0.5"),
-    "rolled": (turned(7.0, axis=0), "looks rotated by 7 deg"),
-    "yawed": (turned(20.0, axis=2), "looks rotated by 20 deg"),
+    "rolled": (Rotation.from_euler("x", 7.0, degrees=True).apply(HERE), "looks rotated by 7 deg"),
+    "yawed": (Rotation.from_euler("z", 20.0, degrees=True).apply(HERE), "looks rotated by 20 deg"),
     "shuffled and wrong": (SHUFFLED * [1, 1, 0.9], "elsewhere"),
     "one moved": (HERE + np.eye(56)[7][:, None] * [0, 0.003, 0], "microphones up to 3 mm elsewhere"),
     "a quarter turn": (HERE[:, [1, 0, 2]] * [-1, 1, 1], "axes swapped"),
     "one twice": (np.vstack([HERE[:55], HERE[:1]]), "microphones 1 and 56 0 m apart"),
 }
 FORMS = "xml", "csv", "json"
-NO_METRES = dict.fromkeys(("millimetres", "centimetres"), "expected positions in metres")
 RIGHT = {
     "the same": HERE,
     "rounded to a millimetre": HERE.round(3),
@@ -150,7 +139,7 @@ def array_file(path: Path, positions: np.ndarray) -> Path:
 @pytest.mark.parametrize("beside", ["model", "data set"])
 def test_a_wrong_array_is_refused(case, form, beside, alone, approach, tmp_path, refused) -> None:
     positions, why = WRONG[case]
-    said = NO_METRES.get(case, why)
+    said = "expected positions in metres" if case == "millimetres" else why
     path, model = (alone, "simulated-56") if beside == "model" else (approach.folder, None)
     mics, states = array_file(tmp_path / f"mics.{form}", positions), tmp_path / "states.jsonl"
     with pytest.raises((OutOfDomainError, InputFileError), match=re.escape(said)):
@@ -169,19 +158,17 @@ def test_equal_positions_are_accepted_in_any_order_and_offset(case: str, alone: 
     AcousticAdapter(MicrophoneArray(RIGHT[case]), RATE, read_model().signature)
 
 
-def test_a_nearly_matching_array_has_no_model_and_a_reason(alone, tmp_path, capsys, caplog) -> None:
+def test_a_nearly_matching_array_has_no_model_and_a_reason(alone, tmp_path, refused, caplog) -> None:
     """Commands that need a model, or have one as an option, raise an error."""
-    mics = tmp_path / "mics.xml"
+    mics, out = tmp_path / "mics.xml", tmp_path / "m.json"
     write_array_xml(mics, MicrophoneArray(HERE * [1, -1, 1]))
-    assert main(["run", str(alone), "--array", str(mics)]) == 0
+    heard = [str(alone), "--array", str(mics)]
+    assert main(["run", *heard]) == 0
     for said in ("mics.xml", "OVAD", "56 microphones", "mm elsewhere", "looks mirrored", "model make"):
         assert said in caplog.text
-    capsys.readouterr()
-    assert main(["run", str(alone), "--array", str(mics), "--model", "simulated-56"]) == 2
-    line = capsys.readouterr().err.strip()
+    line = refused(["run", *heard, "--model", "simulated-56"]).strip()
     assert "\n" not in line and "looks mirrored" in line and "--uncalibrated" in line
-    out = tmp_path / "m.json"
-    assert main(["model", "threshold", str(alone), "--array", str(mics), "--out", str(out)]) == 2
+    assert "looks mirrored" in refused(["model", "threshold", *heard, "--out", str(out)])
     assert not out.exists()
 
 
@@ -365,36 +352,19 @@ def test_evaluating_a_table_of_another_array_is_refused(tmp_path, capsys) -> Non
 
 
 @pytest.mark.long
-def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(alone, tmp_path, capsys) -> None:
+def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(tmp_path, refused) -> None:
     """Thresholds and streams are valid for one array and one signature only."""
     elsewhere = MicrophoneArray(HERE * [1, -1, 1], "mirrored")
     save_model(tmp_path / "own.json", of_array(elsewhere))
     quiet, mics = tmp_path / "quiet.wav", array_file(tmp_path / "mics.csv", elsewhere.positions_m)
     soundfile.write(quiet, 0.01 * RNG.standard_normal((RATE * 2, 56)), RATE, subtype="FLOAT")
     out, streams = tmp_path / "out.json", tmp_path / "s.npz"
-    words = ["--alpha", "0.2", "--out", str(out)]
-    assert main(["model", "threshold", str(quiet), "--array", str(mics), *words]) == 2
-    assert "looks mirrored" in capsys.readouterr().err and not out.exists()
-    heard = ["--array", str(mics), "--model", str(tmp_path / "own.json"), "--save-streams", str(streams)]
+    words, own = ["--alpha", "0.2", "--out", str(out)], ["--model", str(tmp_path / "own.json")]
+    heard = ["--array", str(mics), *own, "--save-streams", str(streams)]
     assert main(["model", "threshold", str(quiet), *heard, *words]) == 0
     written = read_model(out).domain
     assert written is not None and written.array == "mirrored"
-    assert main(["model", "threshold", str(streams), "--model", str(tmp_path / "own.json"), *words]) == 0
+    assert main(["model", "threshold", str(streams), *own, *words]) == 0
     out.unlink()
-    assert main(["model", "threshold", str(streams), *words]) == 2
-    assert "made with another model's signature" in capsys.readouterr().err and not out.exists()
-
-
-def test_evaluate_refuses_a_model_of_another_array(tmp_path, capsys) -> None:
-    save_model(tmp_path / "roof.json", of_array(roof_array_56()))
-    assert study(["table", "--out", str(tmp_path / "e"), "--model", str(tmp_path / "roof.json")]) == 2
-    assert "not the array of the model" in capsys.readouterr().err
-    assert not (tmp_path / "e" / "streets").exists()
-
-
-def test_the_card_of_a_model(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in (["model", "show", "--json"], ["model", "show"]):
-        assert main(words) == 0
-        card = capsys.readouterr().out
-        for said in ("OVAD", "56", "5880", "standing", "gamma", "a moving ego", "Apache-2.0"):
-            assert said in card
+    said = refused(["model", "threshold", str(streams), *words])
+    assert "made with another model's signature" in said and not out.exists()

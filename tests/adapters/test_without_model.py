@@ -20,7 +20,7 @@ from worldstate.belief.street_model import StreetModel
 from worldstate.cli.main import main
 from worldstate.frontend.settings import default_span_deg
 from worldstate.ground import NotUsable, wrap_angle
-from worldstate.measurement import Bearing, Measurement
+from worldstate.measurement import Bearing
 from worldstate.simulation.emitters.syntheses import voice
 
 RATE = 16_000
@@ -98,13 +98,8 @@ def test_commands_print_bearings_and_the_missing_model(tmp_path, capsys, refused
     assert told.count("born") - told.count("died") == len(states[-1].entities)
     assert main(["explain", str(log), "--time", "3"]) == 0
     assert "side unknown: advisory none" in capsys.readouterr().out
-    played = ["live", "--play", *words, "--speed", "100", "--duration", "2"]
-    assert main([*played, "--out", str(tmp_path / "l")]) == 0
-    assert "no model" in capsys.readouterr().out
     for asked in (["--budget", "5"], ["--alpha", "0.02"]):
         assert "expected a model for the array" in refused(["run", *words, *asked])
-    quiet = ["model", "threshold", *words, "--out", str(tmp_path / "m.json")]
-    assert main(quiet) == 2 and "not the array of the model" in capsys.readouterr().err
 
 
 def test_blocks_and_checkpoints_change_nothing(tmp_path: Path) -> None:
@@ -125,15 +120,11 @@ def test_blocks_and_checkpoints_change_nothing(tmp_path: Path) -> None:
         np.testing.assert_allclose(*azimuths, atol=1e-3)
 
 
-def measured(number: int, azimuth_rad: float | None, at_edge: bool = False) -> Measurement:
-    bearing = NotUsable("-") if azimuth_rad is None else Bearing(azimuth_rad, 0.1, 2.0, at_edge)
-    return hop(number, bearing=bearing)
-
-
 def followed(azimuths_rad: list[float | None], at_edge: bool = False) -> list[WorldState]:
     world, states = WorldFilter(no_model=NotUsable("no model")), []
     for number, azimuth_rad in enumerate(azimuths_rad, start=1):
-        world = world.predict_to(number * 10**8).update(measured(number, azimuth_rad, at_edge))
+        bearing = NotUsable("-") if azimuth_rad is None else Bearing(azimuth_rad, 0.1, 2.0, at_edge)
+        world = world.predict_to(number * 10**8).update(hop(number, bearing=bearing))
         states.append(world.state)
     return states
 
@@ -201,11 +192,3 @@ def test_a_vertical_plane_searches_ahead(turn: float, along: list[float]) -> Non
     assert default_span_deg(array, RATE) == 180.0
     mirror = array.delays_s(0.7 + turn) - array.delays_s(-0.7 + turn)
     assert np.ptp(mirror) < 1e-12
-
-
-def test_the_search_sector_follows_the_array_without_a_model() -> None:
-    settings_of = ListenSettings()
-    spans = [settings_of.front_end(MicrophoneArray(one), RATE).azimuth_span_deg for one in (RING, LINE)]
-    assert spans == [(-180.0, 180.0), (-90.0, 90.0)]
-    with_model = Listener("respeaker-4", RATE)
-    assert with_model._source.settings.azimuth_span_deg == 180.0
