@@ -90,7 +90,6 @@ EXTERNAL = '<!DOCTYPE m [<!ENTITY a SYSTEM "file:///etc/hostname">]><MicArray>&a
 
 REFUSED: list[tuple[str | bytes, str]] = [
     ("0.05,0,0,1.0\n0,0.05,0,0.9\n-0.05,0,0,1.1\n0,-0.05,0,0.95\n", "4 numbers per line"),
-    ("1,0,0,5\n2,0,0,6\n3,0,0,7\n4,0,0,8\n", "4 numbers per line"),
     ("0,0.05,0,0,1\n1,0,0.05,0,1\n2,-0.05,0,0,1\n", "5 numbers per line"),
     ("0.05 0 -0.05 0\n0 0.05 0 -0.05\n0 0 0 0\n", "write its transpose"),
     (json.dumps([[0.1, 0, -0.1, 0], [0, 0.1, 0, -0.1], [0] * 4]), "write its transpose"),
@@ -105,18 +104,16 @@ REFUSED: list[tuple[str | bytes, str]] = [
     ('@include "mics.cfg"\ngeneral: { };', "replace @include by the content"),
     ('mics = (\n@include "mics.inc"\n);', "replace @include by the content"),
     ("x;y;z\n0,05;0,00;0,00\n0,00;0,05;0,00\n", "expected decimal points, got decimal commas"),
-    ("0,05\t0\t0\n0\t0,05\t0\n", "decimal commas"),
     ("1 0,05 0 -0,1\n2 0 0,05 0\n", "decimal commas"),
     (b"\x93NUMPY\x01\x00v\x00", "numpy.savetxt"),
     ("mics = ( { mu = ( 0, 0 ); }, { mu = ( 0, 0, 1 ); } );", "as in ODAS"),
     ("mics = ( { mu = ( 0, 0, 0 ); }, { mu = ( 0, 0, 1 ); }", "as in ODAS"),
-    ("mics = ( { mu = ( 0, 1, 0 ); }, { angle = ( 0, 0 ); } );", "as in ODAS"),
     ("mics = ( { mu = ( 0, 1, exit ); }, { mu = ( 0, 0, 1 ); } );", "got ' exit '"),
     (ODAS.replace("MAP", "1, 2, " + "9" * 5000), "channels"),
     (ODAS.replace("MAP", "1, 2, 3, 4"), "channels: expected 3 different"),
     *(
         (json.dumps({"positions_m": PLACES, "channels": one}), "channels: expected 3 different")
-        for one in ([2, 3], [2, 2, 3], [0, 1, 2], [1, 2, 3.0], "2-4")
+        for one in ([2, 2, 3], [0, 1, 2], [1, 2, 3.0], "2-4")
     ),
     (BOMB.format(TWO), "entities, which are refused"),
     (EXTERNAL.format(TWO), "entities, which are refused"),
@@ -125,7 +122,6 @@ REFUSED: list[tuple[str | bytes, str]] = [
     ("0,0,0\n0,0,0.5\n", "vertical line"),
     ("0,1e-5,0\n0,0,0\n", "expected positions in metres"),
     ("0,0.1,0\n0,0.2,0\n0,0.200000001,0\n", "microphones 2 and 3 1e-09 m apart"),
-    ("[[0, 0.1, 0], [0, -0.1]]", "positions"),
     ("[[0, 0.1, 0], [0, -0.1, true]]", "microphone 2: .* finite number as z, got True"),
     ("[[0, 0.1, 0], [0, -0.1, NaN]]", "microphone 2"),
     ('{"positions_m": [[0, 0.1, 0], [0, 1, 0]], "axes": "ned"}', "axes: expected acoular or base_link"),
@@ -133,10 +129,8 @@ REFUSED: list[tuple[str | bytes, str]] = [
     ("[" * 100_000, "does not parse"),
     ("<MicArray>" + TWO, "does not parse"),
     ("<MicArray/>", "expected 2 to 1024"),
-    (f"<MicArray>{POS.format(1)}</MicArray>", "got 1"),
     (f"<MicArray>{TWO}<pos x='1' y='0'/></MicArray>", "microphone 3: .* finite number as z, got None"),
     (f"<MicArray>{TWO}<pos x='1,5' y='0' z='0'/></MicArray>", "microphone 3: .* finite number as x"),
-    (f"<MicArray>{TWO}<pos x='1' y='inf' z='0'/></MicArray>", "microphone 3"),
     (f"<MicArray>{POS.format(1) * 2}</MicArray>", "microphones 1 and 2 0 m apart"),
     ("<MicArray>" + TWO * 513 + "</MicArray>", "got 1026"),
     ("<?xml version='1.0' encoding='klingon'?><MicArray/>", "does not parse"),
@@ -165,12 +159,21 @@ def test_any_bytes_as_an_array(tmp_path_factory: pytest.TempPathFactory, data: b
         read_array(name)
 
 
-@pytest.mark.parametrize(("radius_m", "said"), [(0.05, False), (0.6, False), (1.5, True), (2.0, True)])
-def test_a_ring_of_doubtful_units_logs_a_warning(radius_m, said, tmp_path, caplog) -> None:
-    rows = ((radius_m, 0.0), (0.0, radius_m), (-radius_m, 0.0), (0.0, -radius_m))
-    (tmp_path / "ring.csv").write_text("".join(f"{x},{y},0\n" for x, y in rows))
-    assert read_array(tmp_path / "ring.csv").n_microphones == 4
-    assert ("centimetres or inches" in caplog.text) is said
+RING = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+TRANSPOSED = [[0.1, 0.0, -0.1], [0.0, 0.1, 0.0], [1.4] * 3]
+
+
+@pytest.mark.parametrize(
+    ("rows", "scale", "said"),
+    [
+        *((RING, 0.05, ""), (RING, 0.6, ""), (RING, 1.5, "centimetres or inches")),
+        *((PLACES, 1.0, ""), (TRANSPOSED, 1.0, "write its transpose")),
+    ],
+)
+def test_doubtful_positions_log_a_warning(rows, scale, said, tmp_path, caplog) -> None:
+    (tmp_path / "mics.json").write_text(json.dumps((scale * np.array(rows)).tolist()))
+    assert read_array(tmp_path / "mics.json").n_microphones == len(rows)
+    assert said in caplog.text and bool(said) == bool(caplog.text)
 
 
 @pytest.mark.parametrize("form", ["csv", "header", "xml"])
@@ -185,13 +188,6 @@ def test_microphones_sorted_as_text_are_ordered_by_number(form, tmp_path, caplog
         caplog.clear()
         np.testing.assert_allclose(read_array(tmp_path / "mics").positions_m, places)
         assert ("not in the order of their numbers" in caplog.text) is said
-
-
-def test_a_possible_transpose_logs_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for rows, said in ((PLACES, False), ([[0.1, 0.0, -0.1], [0.0, 0.1, 0.0], [1.4] * 3], True)):
-        (tmp_path / "mics.json").write_text(json.dumps(rows))
-        assert read_array(tmp_path / "mics.json").n_microphones == 3
-        assert ("write its transpose" in caplog.text) is said
 
 
 def test_axes_may_be_those_of_the_other_convention(tmp_path: Path) -> None:
@@ -211,23 +207,13 @@ def test_the_description_shows_an_array_along_the_vehicle() -> None:
     assert "no extent across the vehicle" in stance(sideways)
 
 
-def pair(spacing_m: float) -> MicrophoneArray:
-    return MicrophoneArray([[0, spacing_m, 0], [0, 0, 0]])
-
-
-@pytest.mark.parametrize(
-    ("array", "rate_hz", "band_hz"),
-    [
-        (pair(0.5), 48_000, (300, 1800)),
-        (pair(0.088), 48_000, (300, 1800)),
-        (pair(0.0419), 48_000, (600, 3600)),
-        (pair(0.01), 48_000, (1200, 7200)),
-        (pair(0.01), 8_000, (600, 3600)),
-        (roof_array_56(), 47_998, (300.0, 1800.0)),  # Exactly the paper's band
-    ],
-)
-def test_the_band_follows_the_spacing(array, rate_hz, band_hz) -> None:
-    assert default_band_hz(array, rate_hz) == band_hz
+def test_the_band_follows_the_spacing() -> None:
+    assert default_band_hz(roof_array_56(), 47_998) == (300, 1800), "the band of the paper"
+    for spacing_m, rate_hz, band_hz in (
+        *((0.088, 48_000, (300, 1800)), (0.0419, 48_000, (600, 3600))),
+        *((0.01, 48_000, (1200, 7200)), (0.01, 8_000, (600, 3600))),
+    ):
+        assert default_band_hz(MicrophoneArray([[0, spacing_m, 0], [0, 0, 0]]), rate_hz) == band_hz
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import pytest
 import soundfile
 from camera_boxes import EMPTY, write_boxes
 from made_up_sound import THREE
-from released_data import FOLDER
 from scipy.signal import resample_poly
 
 from worldstate.adapters import OvadDataset, write_array_xml
@@ -94,25 +93,14 @@ def test_a_folder_that_contradicts_its_log_or_has_no_sound_is_refused(tmp_path: 
         Recording.open(tmp_path)
 
 
-def test_the_official_lists() -> None:
-    folder = FOLDER or Path()
-    if not (folder / "timeHorizonStaticTestset.csv").is_file():
-        pytest.skip("the official lists are not here")
-    assert len(read_ids(folder / "timeHorizonStaticTestset.csv")) == 83
-    assert len(read_ids(folder / "timeHorizonDynamicTestset.csv")) == 59
-
-
 @pytest.mark.parametrize(
     ("row", "problem"),
     [
         ("1_00_0002,SA1,left,7.5", "line 2: expected T0 as a frame number"),
-        ("1_00_0002,SA1,left,-3", "T0"),
-        ("1_00_0002,SA1,left,", "T0"),
         ("1_00_0002,SA1,left", "T0"),
         ("1_00_0002,SA1,left,99999999999999999999", "T0"),
         ("1_00_0002,SA1,none,soon", "T0"),
         ("1_00_0002,SA1,front,70", "line 2: expected Class left, none or right, got 'front'"),
-        ("1_00_0002,XA1,left,70", "expected an Environment"),
         ("1_00_0002,../..,left,70", "expected an Environment"),
         ("../../etc,SA1,left,70", "line 2: expected an ID"),
         (",SA1,left,70", "expected an ID"),
@@ -282,13 +270,11 @@ def test_each_window_is_the_second_before_its_end(sounds, extract, tmp_path):
     [
         ("Class", "up", "line 3: expected a class"),
         ("Environment", "", "line 3: expected a value of Environment"),
-        ("End", "soon", "line 3"),
         ("End", "nan", "line 3: expected a finite number as End"),
         ("End", "0.5", "expected 1 s of sound before 0.5 s"),
         ("End", "9", "expected 1 s of sound before 9 s"),
         ("T0", "x", "line 3"),
         ("File", "../secret.wav", "line 3: expected a file inside"),
-        ("File", "/etc/hosts", "line 3: expected a file inside"),
         ("File", "nowhere.wav", "line 3: expected a file nowhere.wav"),
     ],
 )

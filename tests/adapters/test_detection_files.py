@@ -74,7 +74,6 @@ REFUSED = [
     (frames({**GOOD, "scores": [1.5]}), r"boxes\[0\]: .* scores in \[0, 1\], got .* with 1\.5"),
     (frames({**GOOD, "classes_str": [3]}), r"classes_str\[0\]: expected text, got 3"),
     (frames(GOOD, {**GOOD, "scores": [float("nan")]}), "NaN is not a JSON"),
-    (frames({**GOOD, "boxes": [[0, 0, float("inf"), 2]]}), "Infinity is not a JSON"),
     (frames(GOOD).replace("20", "1e999"), r"boxes\[0\]\[3\]: expected a finite number"),
     (frames(GOOD).replace("20", "2" * 5000), "expected JSON"),
     (frames({key: value * 1001 for key, value in GOOD.items()}), "at most 1000"),
@@ -126,10 +125,7 @@ def test_blanks_and_further_keys_do_not_matter_and_a_list_is_needed(tmp_path: Pa
             read_detections(tmp_path / "no.json", rate_hz)
 
 
-BAD_YOLO = [
-    *("car 0 0 1 1", "2 0 0 1", "2 0 0 1 nan", "2 0 nan 1 1", "2 0 0 -1 1", "2 0 0 1 1 1.5"),
-    "2 0 0 1 1 1 1",
-]
+BAD_YOLO = ["car 0 0 1 1", "2 0 0 1", "2 0 nan 1 1", "2 0 0 -1 1", "2 0 0 1 1 1.5", "2 0 0 1 1 1 1"]
 BAD_MOT = [
     *("0,1,0,0,9,9,1,-1,-1,-1", "1.5,1,0,0,9,9,1,-1,-1,-1", "250001,1,0,0,9,9,1,-1,-1,-1"),
     *("nan,1,0,0,9,9,1,-1,-1,-1", "1,1,nan,0,9,9,1,-1,-1,-1", "1,1,0,inf,9,9,1,-1,-1,-1"),
@@ -266,16 +262,13 @@ def numbered(pattern: str, *numbers: object) -> list[str]:
 # Names of label files of exporters with the times of the images in 0.1 s; None if the order is ambiguous.
 NAMES: dict[str, tuple[Sequence[str], Sequence[int] | None]] = {
     "one name and a number": (("street_0", "street_1", "street_3"), (0, 1, 2, 3)),
-    "numbers alone": (("000000", "000001", "000002"), (0, 1, 2)),
     "without leading zeros": (("f8", "f9", "f10"), range(11)),
     "Roboflow": ([f"cam_000{i}_jpg.rf.{n}" for i, n in ((1, "4f1e77"), (2, "08c5"), (3, "1"))], (0, 1, 2)),
     "Roboflow, of other images": (("0001_webp.rf.01", "0002_JPG.rf.02", "0004_tiff.rf.04"), (1, 2, 4)),
-    "Roboflow, of a part": (("cam_0003_png.rf.4f1e", "cam_0005_png.rf.08c5"), (3, 5)),
     "hashes": (("4f1e77aa0b3c", "08c5d2219e71"), None),
     "two cameras": (("left_0001", "right_0001"), None),
     "dates": (numbered("2024-05-01_10-0{}", "0-00", "0-01", "1-00"), None),
     "nanoseconds": (("1700000000000000000", "1700000000100000000"), None),
-    "milliseconds of the epoch": (numbered("1700000000{}", "000", "100", "200"), None),
     "seconds and milliseconds": (numbered("1700000000.{}", 100, 200, 300), None),
     "milliseconds": (("000000", "000100", "000200"), None),
     "every third": (("frame_0", "frame_3", "frame_6", "frame_9"), None),
@@ -310,21 +303,16 @@ FRAMES = [f"frame_{i:04d}.jpg" for i in range(20)]
 # Ids and file names of listed images, and their times in 0.1 s.
 LISTED: dict[str, tuple[Sequence[int | str], Sequence[str | None], Sequence[int]]] = {
     "from 0": (range(4), [None] * 4, range(4)),
-    "from 0, some": ((0, 2, 3), [None] * 3, (0, 2, 3)),
     "from 1": (range(1, 5), [None] * 4, range(4)),
-    "from 1, named": (range(1, 5), FRAMES[:4], range(4)),
     "from 1, named from 1": (range(1, 5), FRAMES[1:5], range(4)),
     "from 1, listed backwards": (range(1, 5), FRAMES[3::-1], (3, 2, 1, 0)),
-    "arbitrary": ((4711, 13, 99, 500_000), FRAMES[:4], range(4)),
     "arbitrary, in another order": ((1, 700, 3), [FRAMES[2], FRAMES[0], FRAMES[1]], (2, 0, 1)),
     "arbitrary, cut from a longer video": ((7, 9, 8), FRAMES[10:13], range(3)),
     "arbitrary, some of a video": ((7, 9, 8), (FRAMES[0], FRAMES[4], FRAMES[9]), (0, 4, 9)),
     "named by times": ((3, 2, 1), numbered("17000000{}.jpg", "00", 12, 25), range(3)),
-    "ids are names": ([name[:10] for name in FRAMES[:4]], [None] * 4, range(4)),
     "ids are names of a part": (("v_0", "v_7", "v_3"), [None] * 3, (0, 7, 3)),
     "ids are numbers as text": (("1", "2", "3"), [None] * 3, range(3)),
     "ids are hashes": (("0a1f", "93bc", "77ee"), FRAMES[:3], range(3)),
-    "Roboflow": ((5, 6), ("a_0002_jpg.rf.ff.jpg", "a_0001_jpg.rf.0e.jpg"), (1, 0)),
 }
 
 

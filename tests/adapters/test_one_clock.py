@@ -10,6 +10,7 @@ import pytest
 import soundfile
 from camera_boxes import EMPTY, LENS, boxed, write_boxes
 from made_up_sound import THREE
+from numpy.typing import ArrayLike
 
 from worldstate import Absent, Listener, nanoseconds
 from worldstate.adapters import ListenSettings, PinholeCamera, Source, open_source
@@ -40,6 +41,12 @@ def heard(sound: Path, start_s: float = 0.0, offset_s: float = 0.0, **beside: ob
     return source
 
 
+def empty_at(times_s: ArrayLike) -> DetectionLog:
+    """Return empty images at these times."""
+    stamps_ns = [nanoseconds(float(at_s)) for at_s in np.asarray(times_s)]
+    return DetectionLog((EMPTY,) * len(stamps_ns), np.array(stamps_ns), "boxes.json")
+
+
 @pytest.mark.parametrize("start_s", STARTS_S)
 def test_images_without_stamps_count_from_the_first_sample(sound: Path, start_s: float) -> None:
     log = DetectionLog.at_rate([EMPTY] * 200, 10.0)
@@ -62,8 +69,7 @@ OFF_S = (1.7e9, 37.0, -37.0, 18.0, 19.0, 3600.0, -86_400.0, 60.0)
 @pytest.mark.parametrize("off_s", OFF_S)
 @pytest.mark.parametrize("start_s", STARTS_S)
 def test_stamps_on_another_clock_are_refused_and_the_offset_brings_them_back(sound, off_s, start_s) -> None:
-    stamps = np.array([nanoseconds(start_s + off_s + 0.1 * i) for i in range(200)])
-    log = DetectionLog((EMPTY,) * 200, stamps, "boxes.json")
+    log = empty_at(start_s + off_s + 0.1 * np.arange(200))
     with pytest.raises(InputFileError, match=r"boxes\.json: .*\"stamp_offset_s\": ") as refused:
         heard(sound, start_s, detections=log)
     named = float(str(refused.value).split('"stamp_offset_s": ')[1].split()[0])
@@ -83,9 +89,7 @@ def test_odometry_on_another_clock_is_refused(sound: Path, off_s: float) -> None
 def test_overlapping_times_are_accepted(sound: Path) -> None:
     """A camera that starts later or runs longer is on the same clock."""
     for first_s, last_s in ((5.0, 25.0), (-30.0, 60.0), (19.0, 400.0), (-37.0, 57.0), (3.0, 4.0)):
-        stamps = np.array([nanoseconds(s) for s in np.arange(first_s, last_s, 0.1)])
-        log = DetectionLog((EMPTY,) * len(stamps), stamps)
-        assert heard(sound, detections=log).detections is not None
+        assert heard(sound, detections=empty_at(np.arange(first_s, last_s, 0.1))).detections is not None
     for told in ((Odometry("wheels", 0, 0.1),), ()):
         heard(sound, others=[told.__iter__])
 
@@ -97,8 +101,7 @@ UNITS = {"microseconds": 1e-3, "milliseconds": 1e-6, "seconds": 1e-9}
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("first_s", [0.0, 1.7e9])
 def test_stamps_in_another_unit_are_refused(sound: Path, unit: str, first_s: float) -> None:
-    stamps = np.unique([round(1e9 * (first_s + 0.1 * i) * UNITS[unit]) for i in range(200)])
-    log = DetectionLog((EMPTY,) * len(stamps), stamps, "boxes.json")
+    log = empty_at(np.unique(np.round(1e9 * (first_s + 0.1 * np.arange(200)) * UNITS[unit])) / 1e9)
     with pytest.raises(InputFileError, match=r"boxes\.json: .*stamps in nanoseconds|clock of the sound"):
         heard(sound, detections=log)
 
@@ -109,11 +112,11 @@ def test_stamps_in_another_unit_are_refused(sound: Path, unit: str, first_s: flo
      (0.0, 6.0, "60 of 60 stamps"), (-30.0, 60.0, "of 900 stamps lie within the sound")],
 )  # fmt: skip
 def test_a_small_overlap_with_the_sound_logs_a_warning(sound, first_s, last_s, told, caplog) -> None:
-    stamps = np.array([nanoseconds(s) for s in np.arange(first_s, last_s, 0.1)])
-    heard(sound, detections=DetectionLog((EMPTY,) * len(stamps), stamps))
+    log = empty_at(np.arange(first_s, last_s, 0.1))
+    heard(sound, detections=log)
     assert told in caplog.text and bool(told) == bool(caplog.text)
     caplog.clear()
-    heard(sound, odometry=OdometryLog(tuple(Odometry("wheels", int(ns), 0.1) for ns in stamps)))
+    heard(sound, odometry=OdometryLog(tuple(Odometry("wheels", int(ns), 0.1) for ns in log.stamps_ns)))
     assert told in caplog.text and bool(told) == bool(caplog.text)
 
 
@@ -210,9 +213,10 @@ def test_the_rate_is_a_key_of_the_camera(sound: Path, tmp_path: Path) -> None:
 
     assert read() == (10.0, True, 4_500_000_000)
     assert read(image_rate_hz=15) == (15.0, False, 3_000_000_000)
-    row = {"boxes": [], "scores": [], "classes_str": []}
-    stamped = [row | {"stamp_ns": 10**8 * i} for i in range(60)]
-    path.write_text(json.dumps({"detections_per_frame": stamped}))
+    written = json.loads(path.read_text())
+    for i, row in enumerate(written["detections_per_frame"]):
+        row["stamp_ns"] = 10**8 * i
+    path.write_text(json.dumps(written))
     assert read(image_rate_hz=15) == (None, False, 4_500_000_000)
 
 

@@ -264,20 +264,6 @@ def test_a_box_is_decoded_as_computed(nanodet):
     np.testing.assert_allclose(session.seen[0, 0], (128 - 103.53) / 57.375, rtol=1e-5)
 
 
-def test_a_cut_box_has_a_lower_score_and_is_suppressed(nanodet):
-    # In the input from 1.5 to 103.5 px: cut by the left edge of every crop but the first.
-    session = OneBox(3, 5, certain(5.375, 0.5, 1, 3))
-    session.logits[1][0, 3 * 26 + 5, :8] = -100.0
-    session.logits[1][0, 3 * 26 + 5, 5:7] = np.log([0.625, 0.375])
-    image = np.zeros((1216, 1936, 3), np.uint8)
-    alone, both = (nanodet.NanoDet(session, crops) for crops in (((100, 0, 832),), ((0, 0, 832),)))
-    assert alone.detect(image).scores[0] == pytest.approx(0.72)
-    assert both.detect(image).scores[0] == pytest.approx(0.9)
-    better, part = [0.0, 0.0, 100.0, 50.0], [60.0, 0.0, 100.0, 50.0]
-    within = nanodet._within_better(np.array([better, part, [90.0, 0.0, 190.0, 50.0]]))
-    assert within.tolist() == [False, True, False]
-
-
 def test_a_model_that_is_not_there_is_named(nanodet, tmp_path):
     with pytest.raises(InputFileError, match="expected an ONNX model"):
         nanodet.open_nanodet(tmp_path / "none.onnx")

@@ -276,23 +276,6 @@ def test_every_encoding_is_decoded(encoding: Encoding, scale: float, channels: i
     assert four_byte_form(data) in (encoding, None)
 
 
-@pytest.mark.parametrize("read_as", SUBTYPES)
-@pytest.mark.parametrize("encoding", ["s24_32", "f32", "s32"])
-@given(scale=st.floats(1e-3, 0.3), channels=st.sampled_from([1, 2, 4, 6, 7, 8, 16]))
-@settings(max_examples=8, deadline=None)
-def test_samples_of_four_bytes_are_not_read_as_three(encoding, read_as, scale, channels) -> None:
-    data = stored(noise(12_000, channels, scale), encoding)
-    if encoding == "s32":
-        data = (np.frombuffer(data, "<i4") & ~0xFF).astype("<i4").tobytes()  # of a converter of 24 bits
-    raw = RawPcm(io.BytesIO(data), RATE_HZ, channels, read_as)
-    certain = read_as in ("s24", "f32") or (encoding == "f32" and read_as in ("s16", "s32", "s24_32"))
-    if certain and read_as != encoding:
-        with pytest.raises(InputFileError, match=f"got samples like those of {encoding}"):
-            open_sound(raw)
-    elif read_as == encoding:
-        open_sound(raw)
-
-
 def test_a_quiet_32_bit_recording_logs_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     quiet = stored(noise(9000, 4, 5e-4), "s32")
     with caplog.at_level(logging.WARNING), open_sound(RawPcm(io.BytesIO(quiet), RATE_HZ, 4, "s32")) as audio:

@@ -72,8 +72,7 @@ def test_the_array_may_be_in_a_file_beside(tmp_path):
 
 
 def changed(part: str, **keys: object) -> object:
-    array = ARRAY | keys if part == "array" else ARRAY
-    front = FRONT | keys if part == "front" else FRONT
+    array, front = (one | keys if part == name else one for name, one in (("array", ARRAY), ("front", FRONT)))
     return {"array": array, "cameras": [front, LEFT]} | (keys if part == "car" else {})
 
 
@@ -87,15 +86,12 @@ def changed(part: str, **keys: object) -> object:
         (changed("array", pitch_deg=100.0), r"car.array: pitch_deg: expected a number in \[-90.0, 90.0\]"),
         (changed("array", position_m=[1200.0, 0.0, 1600.0]), r"car.array: position_m.x: .* got 1200.0"),
         (changed("array", positions_m=[[0.0, 1.0]]), r"car.array.positions_m\[0\]"),
-        (changed("array", positions_m=[[0.0, 1.0, 0.0]]), "expected 2 to 1024 microphones, got 1"),
         (changed("array", yaw_deg="left"), "car.array.yaw_deg: expected a finite number, got 'left'"),
         (changed("front", name="left"), r"car.cameras\[1\].name: expected a unique name, got 'left'"),
         (changed("front", name=None), r"car.cameras\[0\].name: expected a unique name"),
-        (changed("front", fx=500.0), r"car.cameras\[0\]: expected either horizontal_fov_deg or fx"),
         (changed("front", fov=60.0), r"car.cameras\[0\]: expected keys among .*, got \['fov'\]"),
         (changed("front", stamp_offset_s=1e10), r"car.cameras\[0\]: stamp_offset_s: .* got 1"),
         (changed("front", position_m=None), r"car.cameras\[0\]: .*position_m: expected its position"),
-        (changed("front", roll_deg=90.0), r"car.cameras\[0\].roll_deg: expected a number in \(-90"),
     ],
 )
 def test_errors_of_a_car_file_name_the_field(tmp_path, car, said):
