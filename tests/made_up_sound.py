@@ -1,9 +1,13 @@
-"""Made-up sound at the microphones of an array, and a model with a fixed result."""
+"""Made-up sound at the microphones of an array, and models that fit an array."""
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from worldstate.abduction.evidence import SignatureEvidence
+from worldstate.adapters.files.acoustic_domain import domain_of
+from worldstate.adapters.files.model_file import Model, read_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 
 THREE = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.3, 0.0]], "three")
@@ -29,3 +33,9 @@ class Fixed:
 
     def evidence(self, feature: ArrayLike, /) -> SignatureEvidence:
         return self.said
+
+
+def model_of(array: MicrophoneArray, rate_hz: float = 6000.0) -> Model:
+    """Return the shipped model as if it were made for an array."""
+    shipped, domain = read_model(), domain_of(array, [rate_hz], ["SA1"])
+    return replace(shipped, signature=replace(shipped.signature, domain=domain))

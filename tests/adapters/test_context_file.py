@@ -13,7 +13,6 @@ from worldstate.abduction.sequence.sequence_model import COMING_S
 from worldstate.adapters.files.context_file import read_context
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.site_geometry import SideGeometry
-from worldstate.cli.main import main
 from worldstate.core.filter import WorldFilter
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
 from worldstate.state.context import Context, Occluder, corner_at
@@ -99,14 +98,3 @@ def rates() -> dict[str, float]:
 def test_a_wrong_context_is_refused_with_its_key(tmp_path: Path, keys: dict[str, object], said: str) -> None:
     with pytest.raises((InputFileError, InvalidArgumentError), match=said):
         WorldFilter(read_context(written(tmp_path, **keys)))
-
-
-@pytest.mark.long
-def test_run_accepts_a_context_file(approach, tmp_path: Path) -> None:
-    out, file = tmp_path / "s.jsonl", written(tmp_path, arms=[LEFT, RIGHT], site="Elm Street")
-    run = ["run", str(approach.audio_path), "--array", str(approach.array_path), "--context"]
-    assert main([*run, str(file), "--out", str(out)]) == 0
-    last = json.loads(out.read_text().splitlines()[-1])["context"]
-    assert last["site"] == "Elm Street"
-    assert last["occluders"][0]["edge_azimuth_rad"] == pytest.approx(math.atan2(3.0, 5.0))
-    assert main([*run, str(tmp_path / "none.json")]) == 2

@@ -27,14 +27,13 @@ from worldstate.adapters.datasets.feature_extraction import read_labels
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.datasets.ovad import OvadDataset, read_true_tracks
 from worldstate.adapters.export.log_messages import SNAPSHOT_TOPIC, read_messages
-from worldstate.adapters.files.array_file import read_array, write_array_xml
+from worldstate.adapters.files.array_file import read_array
 from worldstate.adapters.files.context_file import read_context
 from worldstate.adapters.files.file_io import atomic_path, write_text
 from worldstate.adapters.files.odometry_file import read_odometry
 from worldstate.adapters.ros.bag_input import read_sound
 from worldstate.adapters.state_log import read_log, read_state_near
 from worldstate.adapters.vehicle.car_file import read_camera_setup, read_car
-from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground.errors import InputFileError, WorldstateError
 from worldstate.operations.labelling.street_passes import read_street
 from worldstate.operations.recordings.hop_table import HopTable, load_streams, save_tables
@@ -398,12 +397,3 @@ def test_a_failed_write_leaves_the_old_file_and_a_finished_one_replaces_it(tmp_p
         np.savez(temporary, value=2)
     assert [path.name for path in tmp_path.iterdir()] == ["states.npz"]
     assert np.load(name)["value"] == 2
-
-
-def test_writers_refuse_a_missing_folder_and_a_folder(tmp_path: Path) -> None:
-    (taken := tmp_path / "taken").mkdir()
-    with pytest.raises(InputFileError, match=r"nowhere/mics.xml: expected an existing folder"):
-        write_array_xml(tmp_path / "nowhere" / "mics.xml", MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]))
-    with pytest.raises(InputFileError, match=r"taken: .*found a folder"):
-        write_text(taken, "x")
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]

@@ -10,12 +10,12 @@ import pytest
 import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_sound import plane_wave
+from made_up_sound import model_of, plane_wave
 from scipy.spatial.transform import Rotation
 from worldstate_lab.cli.main import main as study
 
 from worldstate import Context, MicrophoneArray, Odometry
-from worldstate.adapters import AcousticAdapter, Model, read_array, read_model, save_model, write_array_xml
+from worldstate.adapters import AcousticAdapter, read_array, read_model, save_model, write_array_xml
 from worldstate.adapters.datasets.feature_table import FeatureTable, read_features, write_features
 from worldstate.adapters.datasets.ovad import choose_array
 from worldstate.adapters.files import array_file as arrays
@@ -74,9 +74,7 @@ def test_a_board_with_a_shipped_model_is_used_by_name(tmp_path, monkeypatch, cap
     assert Listener("xmos", 16_000).push(sound)[-1].no_model is not None
     assert "worldstate model make" in caplog.text
     assert main(run) == 0 and "(no model 16)" in capsys.readouterr().out
-    model = read_model()
-    domain = replace(model.domain, array="xmos", positions_m=read_array("xmos").positions_m)
-    made = replace(model, signature=replace(model.signature, domain=domain))
+    made = model_of(read_array("xmos"))
     save_model(tmp_path / "xmos.json.gz", made)
     states = Listener("xmos", 16_000).push(sound)
     assert [state.stamp_ns for state in states] == [10**9 + 10**8 * hop for hop in range(15)]
@@ -310,13 +308,6 @@ def windows() -> FeatureTable:
     return FeatureTable(features, labels, keys, sites, keys, (None,) * 60)
 
 
-def of_array(array: MicrophoneArray) -> Model:
-    """Return the shipped model as if it were made for another array and without windows."""
-    shipped, domain = read_model(), domain_of(array, [RATE], ["SA1"])
-    unseen = replace(shipped.provenance, training_recordings=())
-    return replace(shipped, signature=replace(shipped.signature, domain=domain), provenance=unseen)
-
-
 @pytest.mark.long
 def test_a_table_and_its_model_keep_their_array(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_features(tmp_path / "t.csv", replace(windows(), domain=domain_of(EIGHT, [44_100], ["SA1"])))
@@ -337,7 +328,9 @@ def test_a_table_and_its_model_keep_their_array(tmp_path: Path, capsys: pytest.C
 
 
 def test_evaluating_a_table_of_another_array_is_refused(tmp_path, capsys) -> None:
-    save_model(tmp_path / "m.json", of_array(ovad_array()))
+    made = model_of(ovad_array(), RATE)
+    unseen = replace(made.provenance, training_recordings=())
+    save_model(tmp_path / "m.json", replace(made, provenance=unseen))
     words = ["windows", str(tmp_path / "t.csv"), "--model", str(tmp_path / "m.json"), "--group", "all"]
     for array, why in (
         (EIGHT, "eight: not the array of the model"),
@@ -355,7 +348,7 @@ def test_evaluating_a_table_of_another_array_is_refused(tmp_path, capsys) -> Non
 def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(tmp_path, refused) -> None:
     """Thresholds and streams are valid for one array and one signature only."""
     elsewhere = MicrophoneArray(HERE * [1, -1, 1], "mirrored")
-    save_model(tmp_path / "own.json", of_array(elsewhere))
+    save_model(tmp_path / "own.json", model_of(elsewhere, RATE))
     quiet, mics = tmp_path / "quiet.wav", array_file(tmp_path / "mics.csv", elsewhere.positions_m)
     soundfile.write(quiet, 0.01 * RNG.standard_normal((RATE * 2, 56)), RATE, subtype="FLOAT")
     out, streams = tmp_path / "out.json", tmp_path / "s.npz"

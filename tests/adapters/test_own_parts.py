@@ -216,7 +216,6 @@ def test_the_example_of_a_loop_hands_over_a_hidden_vehicle(capsys):
 # NanoDet: its decoder against a computed box, and the real model on recordings.
 
 RECORDINGS = Path(os.environ.get("OVAD_SEQUENCES", ROOT.parent / "shared" / "ovad-sequences"))
-CAR = 2
 
 
 @pytest.fixture(scope="module")
@@ -224,37 +223,27 @@ def nanodet():
     return example("nanodet")
 
 
-class OneBox:
-    """A session with one detection in every crop, in a cell of stride 16."""
-
-    def __init__(self, row, column, bins, score=0.9):
-        sizes = [(416 // stride) ** 2 for stride in (8, 16, 32)]
-        self.scores = [np.zeros((1, n, 80), np.float32) for n in sizes]
-        self.logits = [np.zeros((1, n, 32), np.float32) for n in sizes]
-        cell = row * 26 + column
-        self.scores[1][0, cell, CAR] = score
-        self.logits[1][0, cell] = np.array(bins, np.float32).reshape(32)
+class OneCar:
+    """A session with one car in every crop: in cell (5, 3) of stride 16, its sides 2, 0.5, 1 and 3 bins
+    away."""
 
     def get_inputs(self):
         return [SimpleNamespace(name="image")]
 
     def run(self, names, feed):
         (self.seen,) = feed.values()
-        return [*self.scores, *self.logits]
-
-
-def certain(*bins):
-    """Return logits with each side at a given bin; a half is shared by two bins."""
-    rows = np.full((4, 8), -100.0)
-    for row, value in zip(rows, bins, strict=True):
-        row[[int(np.floor(value)), int(np.ceil(value))]] = 0.0
-    return rows
+        cells, car, cell = [(416 // stride) ** 2 for stride in (8, 16, 32)], 2, 3 * 26 + 5
+        scores, logits = ([np.zeros((1, n, width), np.float32) for n in cells] for width in (80, 32))
+        bins = np.full((4, 8), -100.0)
+        bins[[0, 1, 1, 2, 3], [2, 0, 1, 1, 3]] = 0.0  # Two bins share a half
+        scores[1][0, cell, car], logits[1][0, cell] = 0.9, bins.ravel()
+        return [*scores, *logits]
 
 
 def test_a_box_is_decoded_as_computed(nanodet):
     # The cell's middle is 16 (5, 3) + 7.5 = (87.5, 55.5); its sides are 32, 8, 16 and 48 px away. The crop
     # begins at (100, 50) and is twice the size of the input.
-    session = OneBox(3, 5, certain(2, 0.5, 1, 3))
+    session = OneCar()
     detector: Detector = nanodet.NanoDet(session, [(100.0, 50.0, 832.0)])
     found = detector.detect(np.full((1216, 1936, 3), 128, np.uint8))
     assert found.labels == ("car",)

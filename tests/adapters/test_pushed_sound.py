@@ -1,6 +1,5 @@
 """Pushed sound gives the states of `run` for any blocks, and continues from a checkpoint at any sample."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +7,9 @@ import pytest
 from camera_boxes import boxed
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_sound import THREE
+from made_up_sound import THREE, model_of
 
 from worldstate import Listener, ListenSettings, MicrophoneArray, Odometry, PinholeCamera
-from worldstate.adapters import Model, read_model
-from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.checkpoint_file import Checkpoint, read_checkpoint, save_checkpoint
 from worldstate.ground import InvalidArgumentError, nanoseconds
 from worldstate.ground.typing import Float32Array
@@ -20,14 +17,8 @@ from worldstate.ground.typing import Float32Array
 RATE_HZ = 16_000
 RNG = np.random.default_rng(5)
 SOUND = (0.1 * RNG.standard_normal((3 * RATE_HZ, 3)).cumsum(axis=1)).astype(np.float32)
+MODEL = model_of(THREE)
 CAR, TRUCK = (boxed((300, 200, 380, 260), label=label) for label in ("car", "truck"))
-
-
-@pytest.fixture(scope="module")
-def model() -> Model:
-    """Return the shipped model with a domain of three microphones."""
-    shipped = read_model()
-    return replace(shipped, signature=replace(shipped.signature, domain=domain_of(THREE, [6000], ["SA1"])))
 
 
 def pushed(listener: Listener, start: int, end: int) -> list[str]:
@@ -40,27 +31,27 @@ def pushed(listener: Listener, start: int, end: int) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def in_one(model: Model) -> list[str]:
-    listener = Listener(THREE, RATE_HZ, model=model, camera=PinholeCamera.ovad())
+def in_one() -> list[str]:
+    listener = Listener(THREE, RATE_HZ, model=MODEL, camera=PinholeCamera.ovad())
     return pushed(listener, 0, len(SOUND))
 
 
 @pytest.mark.long
 @settings(max_examples=8)
 @given(cut=st.integers(0, len(SOUND) - 1))
-def test_another_listener_continues_at_any_sample_bit_for_bit(cut, model, in_one) -> None:
-    first = Listener(THREE, RATE_HZ, model=model, camera=PinholeCamera.ovad())
+def test_another_listener_continues_at_any_sample_bit_for_bit(cut, in_one) -> None:
+    first = Listener(THREE, RATE_HZ, model=MODEL, camera=PinholeCamera.ovad())
     states = pushed(first, 0, cut)
     kept = first.checkpoint()
     first.push(SOUND[cut:])  # a checkpoint stays what it was
     for _ in range(2):  # and is gone on from more than once
-        second = Listener(THREE, RATE_HZ, model=model, camera=PinholeCamera.ovad(), resume=kept)
+        second = Listener(THREE, RATE_HZ, model=MODEL, camera=PinholeCamera.ovad(), resume=kept)
         assert states + pushed(second, cut, len(SOUND)) == in_one
 
 
-def test_a_skipped_loss_keeps_the_time_and_is_reported(model: Model) -> None:
+def test_a_skipped_loss_keeps_the_time_and_is_reported() -> None:
     silence = np.zeros((round(0.9 * RATE_HZ), 3), np.float32)
-    listener = Listener(THREE, RATE_HZ, model=model)
+    listener = Listener(THREE, RATE_HZ, model=MODEL)
     listener.push(np.concatenate([SOUND, silence]))
     listener.skip(4 * 10**9)
     told = {one.stamp_ns: one.heard[0] for one in listener.push(SOUND)}
@@ -72,13 +63,13 @@ def test_a_skipped_loss_keeps_the_time_and_is_reported(model: Model) -> None:
     assert list(told.values())[-1].share == 1.0
 
 
-def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path, model: Model) -> None:
+def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path) -> None:
     told = [Odometry("wheels", nanoseconds(at), 0.0) for at in (0.4, 1.4, 2.4)]
-    whole = Listener(THREE, RATE_HZ, model=model)
+    whole = Listener(THREE, RATE_HZ, model=MODEL)
     whole.add(*told)
     first, rest = whole.push(SOUND[: 2 * RATE_HZ]), None
     save_checkpoint(tmp_path / "now.json", whole.checkpoint())
-    second = Listener(THREE, RATE_HZ, model=model, resume=tmp_path / "now.json", start_s=0.0)
+    second = Listener(THREE, RATE_HZ, model=MODEL, resume=tmp_path / "now.json", start_s=0.0)
     second.add(*told)
     rest = second.push(SOUND)
     assert rest == whole.push(SOUND[2 * RATE_HZ :])
@@ -86,19 +77,19 @@ def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path, mod
     assert read_checkpoint(tmp_path / "now.json").senses is None
 
 
-def test_a_checkpoint_of_another_array_or_rate_is_refused(model: Model) -> None:
-    kept: Checkpoint = Listener(THREE, RATE_HZ, model=model).checkpoint()
+def test_a_checkpoint_of_another_array_or_rate_is_refused() -> None:
+    kept: Checkpoint = Listener(THREE, RATE_HZ, model=MODEL).checkpoint()
     moved = MicrophoneArray([[0.0, 0.2, 0.0], [0.1, 0.0, 0.0], [0.0, -0.2, 0.0]])
     anything = ListenSettings(uncalibrated=True)
     for array, rate, free in ((moved, RATE_HZ, anything), (THREE, 48_000, ListenSettings())):
         with pytest.raises(InvalidArgumentError, match="resume: expected the array, rate"):
-            Listener(array, rate, model=model, resume=kept, settings=free)
+            Listener(array, rate, model=MODEL, resume=kept, settings=free)
     with pytest.raises(InvalidArgumentError, match="model: expected nothing beside a source"):
-        Listener(Listener(THREE, RATE_HZ, model=model)._source, RATE_HZ, model=model)
+        Listener(Listener(THREE, RATE_HZ, model=MODEL)._source, RATE_HZ, model=MODEL)
 
 
-def test_samples_of_another_shape_are_refused_and_nothing_is_lost(model: Model) -> None:
-    listener, other = (Listener(THREE, RATE_HZ, model=model) for _ in range(2))
+def test_samples_of_another_shape_are_refused_and_nothing_is_lost() -> None:
+    listener, other = (Listener(THREE, RATE_HZ, model=MODEL) for _ in range(2))
     wrong: Float32Array
     for wrong in (SOUND[:100, :2], np.full((5, 3), np.nan, np.float32)):
         with pytest.raises(InvalidArgumentError, match="block"):
