@@ -10,7 +10,7 @@ import soundfile
 from camera_boxes import boxed, write_boxes
 from scipy.spatial.transform import Rotation
 
-from worldstate.adapters import read_camera, read_model, save_model
+from worldstate.adapters import read_model, save_model
 from worldstate.adapters.vehicle.car_file import Mounting, read_car
 from worldstate.cli.main import main
 from worldstate.ground.errors import InputFileError, InvalidArgumentError
@@ -43,13 +43,6 @@ def test_rotations_of_a_mounting_equal_scipy(angles):
     turned = Rotation.from_euler("ZYX", [yaw, -pitch, roll], degrees=True).apply(RINGS)
     mounted = Mounting((1.0, 2.0, 3.0), yaw, pitch, roll).applied(RINGS)
     np.testing.assert_allclose(mounted, turned + np.array([1.0, 2.0, 3.0]), atol=1e-12)
-
-
-def test_pitch_turns_camera_and_array_alike(tmp_path):
-    # A point ahead of a sensor with positive pitch is above the vehicle.
-    assert Mounting(pitch_deg=20.0).applied([[1.0, 0.0, 0.0]])[0, 2] > 0.0
-    lens = written(tmp_path, LENS | {"pitch_deg": 20.0, "position_m": [0, 0, 0]})
-    assert read_camera(lens).pitch_rad > 0.0
 
 
 def test_cameras_have_names_and_positions_relative_to_the_array(tmp_path):
