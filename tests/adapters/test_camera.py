@@ -266,7 +266,6 @@ WRONG = [
     ({"horizontal_fov_deg": 181}, r"camera.horizontal_fov_deg: expected a number in \(0.0, 180.0\), got 181"),
     ({"horizontal_fov_deg": None}, "expected either horizontal_fov_deg or fx"),
     ({"fx": 1.0}, "expected either horizontal_fov_deg or fx"),
-    ({"pitch_deg": 90}, r"camera.pitch_deg: .* got 90"),
     ({"roll_deg": -95}, r"camera.roll_deg: .* got -95"),
     ({"horizontal_fov_deg": None, "fx": 500, "cx": 900}, r"camera.cx: .* got 900"),
     ({"horizontal_fov_deg": None, "fx": "500"}, "fx"),
@@ -274,7 +273,6 @@ WRONG = [
     ({"position_m": None}, "camera.position_m: expected its position"),
     ({"min_score": 75}, "camera.min_score"),
     ({"image_rate_hz": 0}, "camera.image_rate_hz"),
-    ({"yaw_deg": 1e9}, r"camera.yaw_deg: .* got 1000000000"),
     ({"stamp_offset_s": 1e11}, "stamp_offset_s"),
     ({"width_px": None}, "width_px"),
 ]

@@ -74,7 +74,6 @@ REFUSED = [
     (frames({**GOOD, "scores": [1.5]}), r"boxes\[0\]: .* scores in \[0, 1\], got .* with 1\.5"),
     (frames({**GOOD, "classes_str": [3]}), r"classes_str\[0\]: expected text, got 3"),
     (frames(GOOD, {**GOOD, "scores": [float("nan")]}), "NaN is not a JSON"),
-    (frames(GOOD).replace("20", "1e999"), r"boxes\[0\]\[3\]: expected a finite number"),
     (frames(GOOD).replace("20", "2" * 5000), "expected JSON"),
     (frames({key: value * 1001 for key, value in GOOD.items()}), "at most 1000"),
     (frames(GOOD | {"stamp_ns": 5}, GOOD), "frame 1: expected stamp_ns, as in other frames"),
@@ -87,7 +86,6 @@ REFUSED = [
     ('{"detections_per_frame": [%s %s]}', "frame 1: expected JSON"),
     ('{"detections_per_frame": [%s, %s]} {}', "expected JSON"),
     ('{"note": {"detections_per_frame": [%s, %s]}}', "expected an object with a list"),
-    ('{"detections_per_frame": [%s, %s, [[[]]]]}', "frame 2: expected an object"),
     ('{"detections_per_frame": [%s, %s], "a": NaN}', "NaN is not a JSON"),
     ('{"detections_per_frame": [%s, %s], "a": "\\ud800"}', "half a surrogate pair"),
     # COCO results.

@@ -70,7 +70,7 @@ def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path) -> 
     first, rest = whole.push(SOUND[: 2 * RATE_HZ]), None
     save_checkpoint(tmp_path / "now.json", whole.checkpoint())
     second = Listener(THREE, RATE_HZ, model=MODEL, resume=tmp_path / "now.json", start_s=0.0)
-    second.add(*told)
+    second.add(*reversed(told))
     rest = second.push(SOUND)
     assert rest == whole.push(SOUND[2 * RATE_HZ :])
     assert [one.stamp_ns for one in first + rest] == [10**8 * tenth for tenth in range(10, 30)]

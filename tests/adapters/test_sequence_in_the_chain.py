@@ -11,7 +11,7 @@ import soundfile
 from made_up_sequence import sequence_model
 from made_up_sound import THREE
 
-from worldstate import Context, Listener, ListenSettings, NotUsable, Odometry, WorldState
+from worldstate import Context, ListenSettings, NotUsable, WorldState
 from worldstate.abduction.evidence import SideEvidence, SignatureEvidence
 from worldstate.abduction.road_users import neutral
 from worldstate.abduction.sequence.sequence_inputs import RECENT_HOPS
@@ -19,7 +19,7 @@ from worldstate.abduction.sequence.sequence_model import AlarmCurve, SequenceAla
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.abduction.signature.ensemble import EnsembleModel, Expert
 from worldstate.abduction.signature.window_classes import WINDOW_CLASSES
-from worldstate.adapters import Step, listen_steps, open_source, read_checkpoint, save_checkpoint
+from worldstate.adapters import Step, listen_steps, open_source
 from worldstate.adapters.acoustic import LEVEL_BAND_HZ
 from worldstate.adapters.files.acoustic_domain import domain_of
 from worldstate.adapters.files.model_file import KindShare, Model, read_model, save_model
@@ -57,23 +57,6 @@ def steps(folder: Path, model: Model | None = None, **options: object) -> Iterat
 @pytest.fixture(scope="module")
 def whole(folder: Path) -> list[Step]:
     return list(steps(folder))
-
-
-def test_measurements_take_effect_at_their_stamp_across_a_checkpoint(folder: Path) -> None:
-    sound, _ = soundfile.read(folder / "sound.wav", dtype="float32")
-    told = [Odometry("wheels", 10**8 * tenth, 2.0) for tenth in (2, 13, 14, 25)]
-    source = open_source(folder / "sound.wav", model=folder / "model.json", others=[lambda: told])
-    recorded = [step.state.to_json() for step in listen_steps(source)]
-    plain = replace(source, others=())
-    running = Listener(plain, RATE_HZ)
-    running.add(*reversed(told))
-    states = running.push(sound[: 2 * RATE_HZ])
-    later = Listener(replace(plain, before=running.checkpoint()), RATE_HZ)
-    later.add(*told)
-    states += later.push(sound[2 * RATE_HZ :])
-    assert [state.to_json() for state in states] == recorded
-    speeds = [state.context.ego_speed_mps for state in states]
-    assert speeds == [2.0] * len(states)
 
 
 def test_a_running_chain_equals_a_stream_on_disk(folder: Path, whole: list[Step]) -> None:
@@ -183,17 +166,6 @@ def test_history_survives_a_short_loss_only(folder: Path, tmp_path: Path) -> Non
         said = [step.measurement.sequence for step in lossy(folder, tmp_path, seconds)[0]]
         reasons = [one.reason if isinstance(one, NotUsable) else "" for one in said]
         assert reasons[len(reasons) - reasons[::-1].index("lost samples")] == first
-
-
-@pytest.mark.long
-def test_a_checkpoint_within_a_loss_continues(folder: Path, tmp_path: Path) -> None:
-    hurt, _ = lossy(folder, tmp_path, 1.0)
-    cut = hurt[25]
-    save_checkpoint(tmp_path / "half.json", cut.checkpoint)
-    assert cut.checkpoint.history is not None and cut.checkpoint.history.missed > 0
-    before = read_checkpoint(tmp_path / "half.json")
-    source = open_source(tmp_path / "lossy.wav", model=folder / "model.json", array=THREE, resume=before)
-    assert [one.state.to_json() for one in listen_steps(source)] == [one.state.to_json() for one in hurt[26:]]
 
 
 def curved(folder: Path) -> Model:

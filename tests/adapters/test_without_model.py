@@ -104,14 +104,11 @@ def test_commands_print_bearings_and_the_missing_model(tmp_path, capsys, refused
 def test_blocks_and_checkpoints_change_nothing(tmp_path: Path) -> None:
     array, sound = MicrophoneArray(RING), talker(RING, -1.0, 1)
     whole = Listener(array, RATE).push(sound)
-    parts, first = Listener(array, RATE), []
-    for block in np.split(sound[:40_000], range(777, 40_000, 777)):
-        first += parts.push(block)
-    second = Listener(array, RATE, resume=parts.checkpoint())
+    parts = Listener(array, RATE)
+    first = [state for block in np.split(sound, range(777, 40_000, 777)) for state in parts.push(block)]
+    assert first == whole
     save_checkpoint(tmp_path / "now.json", parts.checkpoint())
-    kept = read_checkpoint(tmp_path / "now.json")
-    assert kept.world.state == parts.world.state and kept.world.state.entities
-    assert first + second.push(sound[40_000:]) == whole
+    assert read_checkpoint(tmp_path / "now.json").world.state == whole[-1] and whole[-1].entities
     order = [3, 0, 4, 1, 2]
     mixed = Listener(MicrophoneArray(RING[order]), RATE).push(sound[:, order])
     for one, other in zip(whole, mixed, strict=True):
