@@ -22,11 +22,11 @@ from worldstate.abduction.signature.published_signature import ModelDomain
 from worldstate.abduction.signature.site_estimate import SiteEstimateSettings, SiteSignature
 from worldstate.adapters.audio.plain_samples import Encoding
 from worldstate.adapters.audio.sound_file import RawPcm, SoundInput, SoundStream, as_sound, path_of
-from worldstate.adapters.camera.camera_channel import any_motion, seen_in, video_degradation
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionLog, Detector, read_any_detections
+from worldstate.adapters.camera.detectors import ALL_MOTION
 from worldstate.adapters.camera.miss_rates import MissRates, load_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video, seen_in, video_degradation
 from worldstate.adapters.camera.vision_query import SeveralCameras, VisionQuery, within_images
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ, Recording, choose_array
 from worldstate.adapters.files.acoustic_domain import UNFIT, array_of, check_array, heard_with, states_budget
@@ -588,7 +588,7 @@ class SourceSensors:
 
     def boxes_in(self, settings: ListenSettings, detector: str | Detector | None = None) -> ListenSettings:
         """Return the settings with the boxes that are used of the camera, or of a detector of motion."""
-        boxes = any_motion() if isinstance(detector, str) and detector in MOTION else self.setup.boxes
+        boxes = ALL_MOTION if isinstance(detector, str) and detector in MOTION else self.setup.boxes
         return _with_boxes(settings, boxes)
 
     def reported(

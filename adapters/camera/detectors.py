@@ -17,7 +17,7 @@ from worldstate.ground.typing import BoolArray, Float32Array, FloatArray, ImageA
 
 from .box_linking import overlaps
 from .camera_health import check_image
-from .detections import MAX_BOXES_A_FRAME, DetectionFrame
+from .detections import MAX_BOXES_A_FRAME, DetectionFilter, DetectionFrame
 
 # No edge of an image is narrower: pixels have a size, and noise is smoothed before the search.
 NARROWEST_EDGE_PX = 3.0
@@ -39,6 +39,8 @@ EDGE_WIDTH = 0.01
 # 0 accepts every region. The value is below one half, because a car has no edge at its shadow.
 OUTLINED = 0.25
 LABEL = "car"  # Label of all boxes: background subtraction has no classes
+# All boxes of moving objects count, because their score is no confidence.
+ALL_MOTION = DetectionFilter(frozenset({LABEL}), 0.0, 0.0)
 # Smoothing against pixel noise in the gradient; far narrower than any edge width in use.
 _SMOOTHING_PX = 0.7
 # The contrast of a change is the level that it reaches over most of its area.

@@ -18,9 +18,9 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 
-from worldstate.adapters.camera.camera_channel import ImageHealth
 from worldstate.adapters.camera.detections import DetectionFrame, Detector, frame_of
 from worldstate.adapters.camera.miss_rates import MissRates
+from worldstate.adapters.camera.video import ImageHealth
 from worldstate.adapters.files.odometry_file import OdometryRecord
 from worldstate.adapters.own_parts import checked_frame
 from worldstate.core.fixed_lag import LAG_NS

@@ -36,13 +36,12 @@ from worldstate_lab.trials.pass_cache import Failed, PassCache, attempted
 
 from worldstate.abduction.co_evidence import Absent
 from worldstate.adapters.audio.sound_file import open_sound
-from worldstate.adapters.camera.camera_channel import seen_in
 from worldstate.adapters.camera.camera_health import degrade, learn_health
 from worldstate.adapters.camera.detections import DetectionFrame, DetectionLog, read_detections
 from worldstate.adapters.camera.detectors import MotionDetector
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, save_miss_rates
 from worldstate.adapters.camera.pinhole import PinholeCamera
-from worldstate.adapters.camera.video import VIDEO_NAME, open_video
+from worldstate.adapters.camera.video import VIDEO_NAME, open_video, seen_in
 from worldstate.adapters.datasets.ovad import OvadDataset
 from worldstate.adapters.listener import measure_steps
 from worldstate.adapters.source import open_source

@@ -14,7 +14,6 @@ from street_frames import HEIGHT, WIDTH, reference, street
 
 from worldstate import Absent, PinholeCamera, Present, nanoseconds
 from worldstate.adapters import DetectionLog, MotionDetector, VisionQuery, open_video
-from worldstate.adapters.camera.camera_channel import video_degradation
 from worldstate.adapters.camera.camera_health import (
     FAMILIES,
     HealthMonitor,
@@ -25,6 +24,7 @@ from worldstate.adapters.camera.camera_health import (
     strength,
 )
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates, load_miss_rates
+from worldstate.adapters.camera.video import video_degradation
 from worldstate.cli.main import main
 from worldstate.ground.serialisation import decode
 from worldstate.measurement.measurement import Bearing

@@ -6,7 +6,7 @@ Running several detectors over one video in every condition is the expensive ste
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
 from types import MappingProxyType
@@ -15,7 +15,6 @@ import numpy as np
 from scipy.special import ndtr
 
 from worldstate.adapters.audio.sound_file import Audio, RawPcm, open_sound
-from worldstate.adapters.camera.camera_channel import any_motion
 from worldstate.adapters.camera.camera_health import (
     LARGEST_PX,
     LEVELS,
@@ -33,7 +32,7 @@ from worldstate.adapters.camera.camera_health import (
     strength,
 )
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog, Detector
-from worldstate.adapters.camera.detectors import Background, MotionDetector, reduced_to
+from worldstate.adapters.camera.detectors import ALL_MOTION, Background, MotionDetector, reduced_to
 from worldstate.adapters.camera.miss_rates import MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.video import Video
@@ -239,7 +238,7 @@ class StagedDetector:
 
     name: str  # Name in tables and files; includes the name of its model
     make: Callable[[], Detector]  # Returns a new detector for each video and condition, in any process
-    keep: DetectionFilter = field(default_factory=any_motion)  # Filter for its boxes
+    keep: DetectionFilter = ALL_MOTION  # Filter for its boxes
 
 
 def motion_detectors() -> tuple[StagedDetector, ...]:

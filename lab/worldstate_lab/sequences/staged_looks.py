@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from worldstate.adapters.camera.camera_channel import any_motion
 from worldstate.adapters.camera.detections import PARKED_S, DetectionFilter, DetectionLog, kept_and_parked
+from worldstate.adapters.camera.detectors import ALL_MOTION
 from worldstate.adapters.camera.miss_rates import FamilyCounts, MissRates
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
@@ -134,7 +134,7 @@ def left_out_choices(watched: Sequence[WatchedImages]) -> dict[str, BoxChoice]:
 
 def kept_boxes(detector: str) -> DetectionFilter:
     """Return the filter for the boxes of a detector."""
-    return any_motion() if detector == "motion" else NANODET_BOXES
+    return ALL_MOTION if detector == "motion" else NANODET_BOXES
 
 
 def moving_in(log: DetectionLog, keep: DetectionFilter) -> BoolArray:
