@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_sound import model_of
 from scipy.signal import firwin, resample_poly
 
-from worldstate.adapters import ListenSettings, Model, Step, listen_steps, open_source, read_model
+from worldstate.adapters import ListenSettings, Model, Step, listen_steps, open_source, read_array, read_model
 from worldstate.adapters.audio.sound_file import RawPcm
-from worldstate.commissioning.commission import commission
-from worldstate.commissioning.heard_stream import CommissionSettings, quick_settings
 from worldstate.frontend import AcousticFrame, FrontEnd, MicrophoneArray, ovad_array
 from worldstate.ground import wrap_angle
 from worldstate.ground.typing import Float32Array
@@ -24,10 +21,7 @@ from worldstate.simulation import draw_settings, simulate_recording
 
 FULL_HZ = 48_000
 RATES = (8_000, 11_025, 16_000, 22_050, 32_000, 44_100, 96_000)
-AROUND = np.arange(6) * np.pi / 3.0
-RING = MicrophoneArray(
-    [[0, 0, 0], *np.stack([0.043 * np.cos(AROUND), 0.043 * np.sin(AROUND), 0 * AROUND], 1)], "ring"
-)
+RING = read_array("uma-8")
 
 
 class Heard(NamedTuple):
@@ -52,19 +46,12 @@ def steps(heard: Heard, rate: int) -> list[Step]:
     return list(listen_steps(open_source(pipe, array=heard.array, model=heard.model)))
 
 
-COMMISSIONED = "ring of 7, commissioned"
-ARRAYS = ["roof of 56", "ring of 7", pytest.param(COMMISSIONED, marks=pytest.mark.slow)]
-
-
-@pytest.fixture(scope="module", params=ARRAYS)
-def heard(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Heard:
-    rng, array = np.random.default_rng(3), ovad_array() if request.param == "roof of 56" else RING
-    # Any window model that uses the whole feature is suitable.
-    model = read_model() if array is not RING else model_of(RING)
-    if request.param == COMMISSIONED:
-        model = commission(RING, quick_settings(CommissionSettings()), tmp_path_factory.mktemp("streams"))
+@pytest.fixture(scope="module", params=["roof of 56", "ring of 7"])
+def heard(request: pytest.FixtureRequest) -> Heard:
+    array = RING if request.param == "ring of 7" else ovad_array()
+    rng = np.random.default_rng(3)
     drawn = replace(draw_settings("SA1", "left", rng, duration_s=6.0), sample_rate_hz=float(FULL_HZ))
-    return Heard(array, model, simulate_recording(drawn, rng, array).audio)
+    return Heard(array, read_model(array=array), simulate_recording(drawn, rng, array).audio)
 
 
 @pytest.fixture(scope="module")

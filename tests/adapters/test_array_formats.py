@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from worldstate.adapters.files.array_file import named_arrays, read_array, write_array_xml
-from worldstate.adapters.vehicle.car_file import read_car
 from worldstate.cli.common.inputs import add_array_options, stance
 from worldstate.frontend.array.microphone_array import MicrophoneArray, nearest_spacings_m, roof_array_56
 from worldstate.frontend.settings import default_band_hz
@@ -245,12 +244,3 @@ def test_a_file_precedes_a_name_and_an_unknown_name_lists_known_ones(tmp_path: P
         read_array("umma")
     with pytest.raises(InputFileError, match="expected no axes with the name of an array, got acoular"):
         read_array("xmos", "acoular")
-
-
-def test_a_car_file_mounts_a_board_by_its_name(tmp_path: Path) -> None:
-    mounted = {"file": "respeaker-usb", "position_m": [1.0, 0.0, 1.5], "yaw_deg": 90}
-    (tmp_path / "car.json").write_text(json.dumps({"array": mounted}))
-    array = read_car(tmp_path / "car.json").array
-    assert array is not None
-    np.testing.assert_allclose(array.positions_m[0], [1.0, -0.032, 1.5], atol=1e-12)
-    assert array.channels == (2, 3, 4, 5)

@@ -18,12 +18,10 @@ from scripted_states import scripted_states, write_states
 
 from worldstate.adapters import AcousticAdapter, Detector, open_video, write_array_xml
 from worldstate.adapters.camera.box_linking import overlaps
-from worldstate.adapters.live.live_sensors import ImageLooks, image_channel
 from worldstate.adapters.own_parts import OwnDetector, installed, of_part
 from worldstate.belief.street_model import StreetModel
 from worldstate.cli.main import main
-from worldstate.ground.errors import InputFileError, OwnPartError
-from worldstate.ground.values import nanoseconds
+from worldstate.ground.errors import InputFileError
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -175,19 +173,6 @@ def test_a_broken_plug_in_has_its_own_error(how, log, tmp_path, monkeypatch, ref
     installed_module(tmp_path, module, text, f"broken = {module}:export")
     monkeypatch.syspath_prepend(tmp_path)
     assert said in refused(["log", "replay", str(log), "--export", "broken=x"])
-
-
-@pytest.mark.parametrize("error", [SystemExit(0), BaseException("odd"), RuntimeError("no licence")])
-def test_a_detector_that_raises_ends_the_run_with_its_name(error):
-    class Raising:
-        def detect(self, frame):
-            raise error
-
-    images = image_channel()
-    images.put((0.0, np.zeros((480, 640, 3), np.uint8)))
-    looks = ImageLooks(images, OwnDetector.of("mine", Raising), nanoseconds, (640, 480))
-    with pytest.raises(OwnPartError, match=f"mine: expected a part that works, got {type(error).__name__}"):
-        looks.deliver(lambda *look: None)
 
 
 def test_a_signal_during_a_plug_in_is_not_its_error():

@@ -138,18 +138,10 @@ def lossy(folder: Path, tmp_path: Path, seconds: float) -> tuple[list[Step], lis
 @pytest.mark.long
 def test_lost_sound_is_no_evidence_and_has_no_later_effect(folder: Path, tmp_path: Path) -> None:
     hurt, whole = lossy(folder, tmp_path, 1.0)
-    measured = {round(step.state.stamp_ns / 1e9, 1): step.measurement for step in hurt}
-    unheard = [at for at, one in measured.items() if not one.heard.usable]
+    unheard = [step.measurement for step in hurt if not step.measurement.heard.usable]
     # From the first lost hop until 40 % of the window is usable again.
-    assert unheard == [round(3.1 + 0.1 * k, 1) for k in range(13)]
-    refused = NotUsable("lost samples")
-    for at in unheard:
-        one = measured[at]
-        assert one.heard.reason == "lost samples"
-        assert one.sequence == one.bearing == one.approach == refused
-        assert set(one.signature.log_likelihoods) == {0.0}
-    heard = [one.heard for at, one in measured.items() if not 3.0 < at < 5.0]
-    assert {(one.share, one.reason) for one in heard} == {(1.0, None)}
+    assert [one.stamp_ns // 10**8 for one in unheard] == [*range(31, 44)]
+    assert {one.sequence for one in unheard} == {NotUsable("lost samples")}
     ends = [steps[-1].checkpoint for steps in (hurt, whole)]
     assert ends[0].site is not None and ends[1].site is not None
     assert ends[0].site.heard_s == pytest.approx(ends[1].site.heard_s - 1.3, abs=0.05)

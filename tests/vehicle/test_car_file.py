@@ -57,11 +57,15 @@ def test_cameras_have_names_and_positions_relative_to_the_array(tmp_path):
         car.camera("rear")
 
 
-def test_the_array_may_be_in_a_file_beside(tmp_path):
+def test_the_array_may_be_in_a_file_beside_or_a_board(tmp_path):
     (tmp_path / "mics.csv").write_text("\n".join(",".join(map(str, row)) for row in RINGS.tolist()))
     beside = {"array": {"file": "mics.csv"} | {k: v for k, v in ARRAY.items() if k != "positions_m"}}
     inline = read_car(written(tmp_path, CAR)).array
     np.testing.assert_allclose(read_car(written(tmp_path, beside)).array.positions_m, inline.positions_m)
+    mounted = {"file": "respeaker-usb", "position_m": [1.0, 0.0, 1.5], "yaw_deg": 90}
+    board = read_car(written(tmp_path, {"array": mounted})).array
+    np.testing.assert_allclose(board.positions_m[0], [1.0, -0.032, 1.5], atol=1e-12)
+    assert board.channels == (2, 3, 4, 5)
 
 
 def changed(part: str, **keys: object) -> object:
