@@ -33,7 +33,7 @@ check: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p worldstate
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -x -n 2 --dist loadgroup tests/frontend tests/ground tests/house/test_house.py tests/house/test_readme.py
+	$(BIN)/python -m pytest -x -n 2 --dist loadgroup tests/frontend tests/ground tests/house/test_house.py tests/house/test_docs.py
 
 # The tests of the library and of the laboratory.
 test: $(VENV)/.test
@@ -56,7 +56,7 @@ lint: $(VENV)/.test
 	MYPYPATH=lab $(BIN)/mypy -p worldstate_lab
 	$(BIN)/lint-imports
 	$(BIN)/python tools/prose.py
-	$(BIN)/python -m pytest tests/house/test_docs.py -k "who or lines_of_a_page or glossary"
+	$(BIN)/python -m pytest tests/house/test_docs.py -k "who or read_as_text or glossary"
 
 # For use after a change of the types of snapshots or scenes.
 schema: $(VENV)/.core

@@ -1,4 +1,4 @@
-"""The documentation follows the code: every exported name has an example, every command and path exists."""
+"""The documentation follows the code: names have examples, commands and paths exist."""
 
 import doctest
 import importlib
@@ -16,10 +16,14 @@ from worldstate.cli.main import PROGRAM, current_words
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "docs" / "_ext"))
 import figures  # noqa: E402
+import model_cards  # noqa: E402
 import reference  # noqa: E402
 
-PAGES = [*sorted((ROOT / "docs").rglob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md"))]
+PAGES = [*sorted((ROOT / "docs").rglob("*.md")), *ROOT.glob("*.md")]
 HOMES = reference.homes(reference.exports())
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+# Addresses outside the project are those of the paper's references.
+ADDRESSES = {"https://doi.org/10.1109/LRA.2021.3062254"}
 
 
 def examples(value: object) -> list[doctest.Example]:
@@ -101,7 +105,10 @@ def options_of(program: str, called: str) -> set[str]:
     return {*PROGRAMS[program].parser(called)._option_string_actions, "--results"}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+# The changelog has the commands of former versions.
+@pytest.mark.parametrize(
+    "page", [one for one in PAGES if one.stem != "CHANGELOG"], ids=lambda page: page.name
+)
 def test_commands_of_a_page_exist_with_their_options(page):
     for program, words in re.findall(CALL, page.read_text(encoding="utf-8"), flags=re.MULTILINE):
         said = current_words(words.split("#")[0].split()) if program == "worldstate" else words.split()
@@ -127,3 +134,80 @@ def test_pages_are_those_that_make_figures_writes():
 def test_figures_of_the_readme_are_taken_by_name():
     template = (figures.TEMPLATES / "README.md.in").read_text(encoding="utf-8")
     assert len(figures.FIGURE.findall(template)) >= 9
+
+
+def block(language: str) -> str:
+    return re.search(rf"```{language}\n(.*?)```", README, flags=re.DOTALL).group(1)
+
+
+def test_first_program_prints_what_readme_shows(approach, tmp_path, monkeypatch, capsys):
+    demo = tmp_path / "out" / "demo"
+    demo.mkdir(parents=True)
+    (demo / "recording").symlink_to(approach.folder.parents[2])
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block("python"), "README.md", "exec"), {})
+    assert capsys.readouterr().out == block("text")
+
+
+def test_readme_is_short():
+    results = re.search(r"\n## Results\n(.*?)\n## ", README, flags=re.DOTALL).group(1)
+    assert len(README.splitlines()) <= 110
+    assert len(block("python").splitlines()) <= 8
+    assert len(re.findall(r"\d+(?:\.\d+)?", results)) <= 18
+    assert len(re.findall(r"^\| .* \[.*, .*\] \| \[.*\]\(.*\) \|$", results, flags=re.MULTILINE)) == 6
+
+
+def test_moving_picture_is_small():
+    (picture,) = re.findall(r"!\[[^]]+\]\(([^)]+)\)", README)
+    assert (ROOT / picture).stat().st_size < 2_000_000
+
+
+def test_every_outside_address_is_on_the_list():
+    files = [*PAGES, *(ROOT / "docs" / "templates").rglob("*.in")]
+    code = re.compile(r"^```.*?^```|`[^`\n]*`", flags=re.DOTALL | re.MULTILINE)
+    found = {
+        (path.name, address)
+        for path in (*files, ROOT / "pyproject.toml", ROOT / "CITATION.cff")
+        for address in re.findall(r"https?://[^\s)\"'>\]]+", code.sub("", path.read_text("utf-8")))
+    }
+    assert [one for one in found if one[1] not in ADDRESSES] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_inside_the_project_leads_to_a_file(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    links = re.findall(r"\]\(([^)\s]+)\)", text)
+    paths = [link.partition("#")[0] for link in links if not re.match(r"https?:|#", link)]
+    assert [path for path in paths if "api/" not in path and not (page.parent / path).exists()] == []
+
+
+def test_every_picture_has_a_description_and_a_caption():
+    missing = []
+    for page in PAGES:
+        lines = page.read_text("utf-8").splitlines()
+        for at, line in enumerate(lines):
+            if line.startswith("!["):
+                caption = next((after for after in lines[at + 1 :] if after), "")
+                if len(line.partition("](")[0]) <= 20 or not caption.startswith("*"):
+                    missing.append(f"{page.name}: {line}")
+    assert missing == []
+
+
+def test_page_of_model_cards_matches_the_models():
+    assert model_cards.PAGE.read_text("utf-8") == model_cards.page()
+
+
+def test_version_is_the_same_everywhere():
+    cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text("utf-8"), flags=re.MULTILINE)
+    assert cited.group(1) == worldstate.__version__
+
+
+def test_tables_of_commands_are_complete():
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
+    section = page.partition("\n## ")[0]
+    benches = {words for words in LABORATORY.commands if words.startswith("bench")}
+    for name, program in PROGRAMS.items():
+        rows = re.findall(rf"^\| `{name} ([^`]+)`", section, flags=re.MULTILINE)
+        shown = {program.called(words.split()) for words in rows}
+        # One row describes all benches.
+        assert shown - {"bench"} == {*program.commands} - {*program.hidden, *benches}
