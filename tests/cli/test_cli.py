@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -13,12 +14,15 @@ import jsonschema
 import numpy as np
 import pytest
 import soundfile
+from scripted_states import scripted_states, write_states
 from worldstate_lab.cli.main import PROGRAM as LABORATORY
 
 import worldstate
 from worldstate.adapters.files import array_file
 from worldstate.adapters.files.model_file import DataSource, KindShare, RealFigure, read_model, save_model
+from worldstate.adapters.ros.message_types import typestore
 from worldstate.cli.common import progress
+from worldstate.cli.completion import shell_script
 from worldstate.cli.main import FORMER, FORMER_OPTIONS, PROGRAM, main
 from worldstate.ground.errors import InputFileError
 from worldstate.state import snapshot_schema
@@ -90,19 +94,38 @@ def own(tmp_path, monkeypatch):
             "own.wav --array mics.csv --model uma-8",
             ("not the array of the model", "4 microphones", "--uncalibrated"),
         ),
-        ("own.wav --figure f.png", ("worldstate[plot]",)),
-        ("own.wav --export mcap=f.mcap", ("worldstate[mcap]",)),
         ("nothing.wav --out s.jsonl", ("nothing.wav",)),
         ("own.wav --array uma-8 --out s.jsonl", ("own.wav", "7", "4")),
     ],
 )
-def test_a_wrong_call_is_answered_in_one_line(line, said, own, capsys, monkeypatch):
-    for package in ("matplotlib", "mcap"):
-        monkeypatch.setitem(sys.modules, package, None)
+def test_a_wrong_call_is_answered_in_one_line(line, said, own, capsys):
     assert main(["run", *line.split()]) == 2
     printed = one_line_of(capsys)
     assert all(words in printed for words in said)
     assert {path.name for path in own.iterdir()} == {"own.wav", "mics.csv"}
+
+
+@pytest.mark.parametrize(
+    ("line", "package", "extra"),
+    [
+        ("run own.wav --figure f.png", "matplotlib", "plot"),
+        ("run own.wav --export mcap=f.mcap", "mcap", "mcap"),
+        ("log replay states.mcap", "mcap", "mcap"),
+        ("log replay states.jsonl --export rerun=f.rrd", "rerun", "rerun"),
+        ("log replay states.jsonl --export osi=f.osi", "osi3", "osi"),
+        ("log replay states.jsonl --export rosbag=f", "rosbags", "ros"),
+        ("run states.mcap", "rosbags", "ros"),
+    ],
+)
+def test_the_extra_of_a_missing_package_is_named(line, package, extra, own, capsys, monkeypatch):
+    for name in ("states.jsonl", "states.mcap"):
+        write_states(Path(name), scripted_states())
+    before = sorted(own.iterdir())
+    typestore.cache_clear()
+    monkeypatch.setitem(sys.modules, package, None)
+    assert main(line.split()) == 2
+    assert f"worldstate[{extra}]" in one_line_of(capsys)
+    assert sorted(own.iterdir()) == before
 
 
 def test_progress_is_a_line_where_there_is_no_terminal(monkeypatch, capsys):
@@ -127,23 +150,15 @@ def test_a_former_command_is_refused_with_its_successor(former, capsys):
     assert " ".join(words) in programs[program].commands
 
 
-def test_a_card_names_each_source_by_use_with_its_licence_none_stated_included(tmp_path, capsys):
-    sources = (DataSource("some windows", "coefficients"), DataSource("some clips", "thresholds", "CC0"))
-    made = read_model()
-    save_model(tmp_path / "m.json.gz", replace(made, provenance=replace(made.provenance, sources=sources)))
-    assert main(["model", "show", str(tmp_path / "m.json.gz")]) == 0
-    card = capsys.readouterr().out
-    assert re.search(r"source 1 +some windows: coefficients; licence: none stated\n", card)
-    assert re.search(r"source 2 +some clips: thresholds; licence: CC0\n", card)
-
-
 @pytest.mark.parametrize("own", [False, True])
-def test_a_card_states_the_gap_of_others_only_without_recordings_of_its_own(own, tmp_path, capsys):
+def test_a_card_has_its_sources_and_the_gap_of_others_only_without_own_recordings(own, tmp_path, capsys):
     gap = RealFigure("AUROC", 0.98, 0.75, 0.63, 0.87, "a car", 2, 45, "a command")
     rows = (gap, replace(gap, simulated=0.97, real=0.82, microphones=7, own=True)) if own else (gap,)
     kinds = (KindShare("bicycle", 0.0, 12), KindShare("car", 0.777, 49))
     made = read_model()
-    provenance = replace(made.provenance, real=rows, kinds=kinds, exam={"detected": 0.5})
+    sources = DataSource("some windows", "coefficients"), DataSource("some clips", "thresholds", "CC0")
+    about = {"real": rows, "kinds": kinds, "exam": {"detected": 0.5}, "sources": sources}
+    provenance = replace(made.provenance, **about)
     save_model(tmp_path / "m.json.gz", replace(made, provenance=provenance))
     assert main(["model", "show", str(tmp_path / "m.json.gz")]) == 0
     card = capsys.readouterr().out
@@ -153,6 +168,8 @@ def test_a_card_states_the_gap_of_others_only_without_recordings_of_its_own(own,
     )
     without = "no real recording of such an array and motion; AUROC: 0.98 in simulation was 0.75 [0.63, 0.87]"
     assert said.startswith(alone if own else without)
+    assert re.search(r"source 1 +some windows: coefficients; licence: none stated\n", card)
+    assert re.search(r"source 2 +some clips: thresholds; licence: CC0\n", card)
     assert re.search(r"kind 1 +bicycle: 0\.00 of 12 simulated approaches", card)
     assert re.search(r"kind 2 +car: 0\.78 of 49 ", card)
     assert re.search(r"simulated_exam +detected 0\.5\n", card)
@@ -230,12 +247,6 @@ def test_a_verb_shows_the_arguments_that_the_command_has(verb):
     assert options - own <= taken | {"start"} and "topics" in taken
 
 
-def test_console_command_is_installed():
-    command = Path(sys.executable).parent / "worldstate"
-    done = subprocess.run([command, "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("worldstate ")
-
-
 @pytest.mark.long
 def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
     states = tmp_path / "states.jsonl"
@@ -264,11 +275,39 @@ def test_the_help_names_every_exit_code(capsys):
         assert re.search(rf"^\|.*\b{code}\b.*\|", page, flags=re.MULTILINE)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("words", [["array", "bearings", "--out", "b.csv"], ["array", "check"]])
-def test_bearings_and_check_say_how_far_they_are(words, approach, tmp_path, monkeypatch):
-    steps = []
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(progress.Bar, "advance", lambda bar, amount=1.0: steps.append(amount))
-    main([*words, str(approach.folder)])
-    assert len(steps) == 10
+BASH = shutil.which("bash")
+ASK = """
+COMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
+_shtab_worldstate; printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+
+
+@pytest.fixture(scope="module")
+def script():
+    pytest.importorskip("shtab")
+    return shell_script(PROGRAM, "bash")
+
+
+@pytest.mark.skipif(BASH is None, reason="there is no bash here")
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["worldstate", "l"], ["live", "log"]),
+        (["worldstate", "array", "b"], ["bounds", "bearings"]),
+        (["worldstate", "sim", "make", "--traffic", "b"], ["busy", "bicycle-only"]),
+        (["worldstate", "run", "a.wav", "--uncal"], ["--uncalibrated"]),
+        (["worldstate", "completion", ""], ["bash", "zsh", "tcsh"]),
+        (["worldstate", "live", "--uncalibrated", "--save-s"], ["--save-state"]),
+        (["worldstate", "run", "--array", "pyproj"], ["pyproject.toml"]),
+    ],
+)
+def test_bash_completes(script, words, found, request):
+    asked = script + ASK.format(words=" ".join(f"'{word}'" for word in words))
+    command, root = [BASH, "--norc", "-c", asked], request.config.rootpath
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=20, cwd=root, check=False)
+    assert sorted(answer.stdout.split()) == sorted(found)
+
+
+def test_it_is_printed_alone_so_that_a_shell_can_read_it(script, capsys):
+    assert main(["completion", "bash"]) == 0
+    assert capsys.readouterr().out == script + "\n"

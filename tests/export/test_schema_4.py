@@ -8,14 +8,14 @@ import runpy
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from mcap.writer import Writer
 from scripted_states import scripted_states, write_states
 
 from worldstate import WorldState
-from worldstate.adapters.export.log_messages import read_messages
+from worldstate.adapters.export.log_messages import image_message, mcap_file, read_messages, sound_message
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.ros.bag_writer import risk_advisories
 from worldstate.adapters.state_log import read_log
@@ -53,28 +53,16 @@ def former_log(name: str, folder: Path) -> Path:
 
 
 def former_mcap(name: str, folder: Path) -> Path:
-    """Write a former log's lines as `--export mcap` did, with a scene, an image and sound beside."""
-    path, time = folder / f"{name}.mcap", {"sec": 1, "nsec": 0}
-    beside: dict[str, dict[str, Any]] = {
-        "/worldstate/scene": {"deletions": [], "entities": []},
-        "/camera/image": {"timestamp": time, "frame_id": "camera", "data": "AAAA", "format": "jpeg"},
-        "/microphones/sound": {
-            "timestamp": time, "data": "AAAA", "format": "pcm-s16", "sample_rate": 8000,
-            "number_of_channels": 1,
-        },
-    }  # fmt: skip
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("any", "jsonschema", b"{}")
-        topics = ("/worldstate/snapshot", *beside)
-        channels = {one: writer.register_channel(one, "json", schema) for one in topics}
-        for line in former_log(name, folder).read_text().splitlines():
+    """Write a former log's lines as MCAP, with an empty scene, an image and sound beside each."""
+    path, form = folder / f"{name}.mcap", {"schema_name": "any", "schema": b"{}"}
+    with mcap_file(path) as write:
+        for line in former_log(name, folder).read_bytes().splitlines():
             stamp_ns = json.loads(line)["stamp_ns"]
-            texts = {"/worldstate/snapshot": line} | {topic: json.dumps(one) for topic, one in beside.items()}
-            for topic, text in texts.items():
-                writer.add_message(channels[topic], stamp_ns, text.encode(), stamp_ns)
-        writer.finish()
+            texts = {"snapshot": line, "scene": b'{"deletions": [], "entities": []}'}
+            for topic, data in texts.items():
+                write(SimpleNamespace(topic=f"/worldstate/{topic}", stamp_ns=stamp_ns, data=data, **form))
+            write(image_message(stamp_ns, b"a jpeg"))
+            write(sound_message(stamp_ns, np.zeros(80, np.float32), 8000))
     return path
 
 
@@ -91,19 +79,17 @@ def test_a_former_log_is_read_as_its_upgrade_and_loses_nothing(name, tmp_path):
     assert again.read_bytes() == upgraded.read_bytes()
     if log.suffix == ".jsonl":
         for before, after in zip(*(map(json.loads, path.open()) for path in (log, upgraded)), strict=True):
-            assert after.pop("schema")["version"] == "4.2.0" and before.pop("schema")["version"] == "3.0.0"
+            assert after.pop("schema")["version"] == "4.2.0" and before.pop("schema")
             for cue in after["cues"]:
                 assert cue.pop("usable") == (not cue.pop("why_not"))
-            if before["budget"] is not None:
-                assert (
-                    before["budget"].pop("threshold_shift_nats") == before["budget"]["tally"].pop("lost") == 0
-                )
+            if budget := before["budget"]:
+                assert budget.pop("threshold_shift_nats") == budget["tally"].pop("lost") == 0
             # Added since.
             assert after["context"].pop("hidden_by_side") is None and after.pop("no_model") is None
             assert not (after["bearing"] or {"at_edge": False}).pop("at_edge")
             assert all(one.pop("kinds") is None for one in after["heard"] or ())
-            if after["budget"] is not None:
-                assert after["budget"].pop("asked_alpha") is after["budget"].pop("promise") is None
+            if budget := after["budget"]:
+                assert budget.pop("asked_alpha") is budget.pop("promise") is None
             assert after == before
 
 
@@ -161,14 +147,9 @@ def test_every_consumer_of_an_advisory_is_given_that_it_is_not_usable(tmp_path, 
 def without_model(state: WorldState) -> WorldState:
     """Return what an array without a model can state: where something sounds, no side, class or risk."""
     cues = (RiskCue(None, 0.4, 0.2, None, None, None, None, None),)
-    heard = [
-        replace(
-            one, status=None, hidden_probability=None, classification=None, direction=None, sides=(),
-            sector_rad=None,
-        )
-        for one in state.entities
-    ]  # fmt: skip
-    return replace(state, cues=cues, entities=tuple(heard), relations=(), calibrated=False)
+    unknown = dict.fromkeys(("status", "hidden_probability", "classification", "direction", "sector_rad"))
+    heard = tuple(replace(one, sides=(), **unknown) for one in state.entities)
+    return replace(state, cues=cues, entities=heard, relations=(), calibrated=False)
 
 
 def test_what_has_no_side_class_or_risk_is_left_out_and_not_taken_for_zero(tmp_path, capsys):

@@ -106,9 +106,10 @@ def options_of(program: str, called: str) -> set[str]:
 
 
 # The changelog has the commands of former versions.
-@pytest.mark.parametrize(
-    "page", [one for one in PAGES if one.stem != "CHANGELOG"], ids=lambda page: page.name
-)
+TODAY = [page for page in PAGES if page.stem != "CHANGELOG"]
+
+
+@pytest.mark.parametrize("page", TODAY, ids=lambda page: page.name)
 def test_commands_of_a_page_exist_with_their_options(page):
     for program, words in re.findall(CALL, page.read_text(encoding="utf-8"), flags=re.MULTILINE):
         said = current_words(words.split("#")[0].split()) if program == "worldstate" else words.split()

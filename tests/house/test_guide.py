@@ -162,10 +162,7 @@ def test_the_index_lists_all_seven_tutorials():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "script",
-    [marked(one) for one in SCRIPTS],
-)
+@pytest.mark.parametrize("script", [marked(one) for one in SCRIPTS])
 def test_a_tutorial_prints_the_output_of_its_page(script, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.chdir(tmp_path)

@@ -154,9 +154,13 @@ def test_everything_can_be_imported_at_once():
     assert set(exporting_packages()["worldstate"].__all__) <= set(names)
 
 
-@pytest.mark.parametrize("command", [["-m", "worldstate"], ["-m", "worldstate.cli.main"]])
-def test_it_runs_as_a_module_and_names_its_version(command):
-    assert printed_by(*command, "--version").split() == ["worldstate", worldstate.__version__]
+CONSOLE = str(Path(sys.executable).parent / "worldstate")
+
+
+@pytest.mark.parametrize("command", [[sys.executable, "-m", "worldstate"], [CONSOLE]])
+def test_it_runs_as_a_module_and_as_a_command_and_names_its_version(command):
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["worldstate", worldstate.__version__]
 
 
 # Stands for pip-audit, which takes a list without versions, and passes over unknown ones without --strict.

@@ -52,7 +52,6 @@ from worldstate.frontend.given_spectra import SpectrumFrontEnd
 from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.ground.errors import InvalidArgumentError, WorldstateError
 from worldstate.ground.serialisation import decode
-from worldstate.ground.threads import BoundedChannel
 from worldstate.ground.values import nanoseconds
 from worldstate.measurement import (
     Approach,
@@ -191,38 +190,31 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "miss rate that falls with azimuth": (misses(beta=((0.2, 0.3), (0.1, 0.4))), "beta"),
     "miss rate above one": (misses(beta=((0.2, 1.3), (0.3, 1.4))), "beta"),
     "miss rates without a row for each azimuth": (misses(beta=((0.2, 0.3),)), "beta"),
-    "miss rate that is no number": (misses(beta=((0.2, NAN), (0.3, 0.4))), "beta"),
     "azimuths that do not begin at zero": (misses(beta=BETA, azimuth_deg=(5, 30)), "azimuth_deg"),
     "azimuths that fall": (misses(beta=BETA, azimuth_deg=(30, 0)), "azimuth_deg"),
-    "degradations above one": (misses(beta=BETA, degradation=(0, 2)), "degradation"),
     "degradation outside of the table": (partial(default_miss_rates(), 0.0, 1.2), "degradation"),
     "grid with a weight of zero": (partial(isotonic_grid, [[0.5]], [[0.0]]), "weights"),
-    "grid with a negative weight": (partial(isotonic_grid, [[0.5]], [[-1.0]]), "weights"),
     "grid with more weights than values": (partial(isotonic_grid, [[0.5]], [[1.0, 1.0]]), "weights"),
     "threshold without recordings": (threshold([]), "window"),
     "threshold of an empty recording": (threshold([[]]), ""),
     "threshold of a score that is no number": (threshold([[0.5, NAN]]), ""),
     "threshold for a budget of one": (threshold([[0.5]], alpha=1.0), "alpha"),
-    "threshold for a negative budget": (threshold([[0.5]], alpha=-0.1), "alpha"),
     "threshold for no hops": (threshold([[0.5]], sustain_hops=0), "hops"),
     "policy that is sustained for no hops": (policy(sustain_hops=0), "sustain_hops"),
     "policy with a budget of one": (policy(alpha=1.0), "alpha"),
     "policy with a prior of two classes": (policy(reference_prior=(0.5, 0.5)), "reference_prior"),
-    "policy with a prior that sums to 1.5": (policy(reference_prior=(0.5, 0.5, 0.5)), "reference_prior"),
     "policy with a miss rate above one": (policy(miss_rate=2.0), "miss_rate"),
     "risk map that falls": (partial(PlattMap, 1.0, 0.0), "slope"),
     "risk map with statistics that fall": (partial(IsotonicMap, (0.5, 0.1), (0.0, 1.0)), "do not fall"),
     "risk map with a risk above one": (partial(IsotonicMap, (0.1, 0.5), (0.0, 1.5)), "risks"),
     "prior of two explanations for four": (prior([0.0, 0.0]), "log_prior"),
     "prior that is no number": (prior([0.0, 0.0, NAN, 0.0]), "log_prior"),
-    "infinite prior": (prior([0.0, 0.0, math.inf, 0.0]), "log_prior"),
     "prior that excludes everything": (prior([-math.inf] * 4), "log_prior"),
     "observation that nothing explains": (
         prior([-math.inf, 0.0, -math.inf], evidence=ONE, co_evidence=Absent(0.0)), "co-evidence"),
     "negative prior of a statistic": (partial(statistic, ONE, Absent(0.0), (0.5, -0.1, 0.6)), "negative"),
     "no descriptors": (grounded([]), "descriptors"),
     "one descriptor twice": (grounded([grounding.car(), grounding.car()]), "descriptors"),
-    "observable with a negative spread": (partial(grounding.Observable, 1.0, -1.0), "std"),
     "coupling with one speed twice": (
         partial(grounding.Coupling, "x", (1.0, 1.0), ((0.0, 1.0),), 1.0), "rising"),
     "descriptor with one observable twice": (
@@ -256,7 +248,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "window classes in another order": (partial(checked_classes, (*CLASSES, "direct", "both")), "classes"),
     "unknown window class": (partial(checked_classes, (*CLASSES, "tram")), "classes"),
     # Cameras, ports and sound
-    "camera with a view of zero": (camera(half_angle_rad=0.0), "half_angle_rad"),
     "camera with a view of 180 degrees": (camera(half_angle_rad=1.6), "half_angle_rad"),
     "camera without columns": (camera(width_px=0), "width_px"),
     "camera with a nominal range of 0.5 m": (camera(nominal_range_m=0.5), "nominal_range_m"),
@@ -283,7 +274,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "look without an image": (partial(LISTENER.look, 0, None), "look: expected a DetectionFrame"),
     "measurement of None": (partial(LISTENER.add, None), "add: expected Measurement"),
     "forgetting time of zero": (partial(ListenSettings, forgetting_s=0.0), "forgetting_s"),
-    "channel of no items": (partial(BoundedChannel, 0), "capacity"),
     **{f"address {one}": (partial(DetectionSocket, one, nanoseconds), "expected HOST:PORT")
        for one in ("9100", "127.0.0.1:x", "127.0.0.1:70000")},
     **{f"sound at {rate} Hz": (heard_at(rate), f"at least 6000 Hz, got {rate} Hz")
@@ -331,14 +321,12 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "watch with one bet": (watch(bet=(0, (0.1,))), "watch"),
     "watch with evidence of one rate": (watch(within=Evidence((1.0,))), "watch"),
     "watch with evidence of zero": (watch(onsets=Evidence((0.0,) * len(RATES))), "watch"),
-    "watch with evidence of 1e9": (watch(onsets=Evidence((1e9,) * len(RATES))), "watch"),
     # Front-end
     "band above half the recorded rate": (
         lambda: FrontEnd(SQUARE, 8_000, ListenSettings(band_hz=(300.0, 5000.0)).front_end(SQUARE, 8_000)),
         "less than half the sample rate of 8000"),
     "one microphone": (partial(MicrophoneArray, [[0, 0, 0]]), "2 to 1024"),
     "positions in a plane": (partial(MicrophoneArray, [[0, 0], [1, 1]]), r"shape \(any, 3\)"),
-    "position that is no number": (partial(MicrophoneArray, [[0, 0, 0], [0, 0, NAN]]), "finite"),
     "positions as text": (partial(MicrophoneArray, [["0", "0", "0"], ["0", "1", "0"]]), "numbers"),
     "positions of different length": (partial(MicrophoneArray, [[0, 0, 0], [0, 1]]), "numbers"),
     "two pairs of microphones at one place": (
@@ -359,7 +347,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "block of one dimension": (block(np.zeros(10)), "block"),
     "block of text": (block("sound"), "block"),
     "block of None": (block([[None] * 4]), "block"),
-    "infinite samples": (block(np.full((2, 4), np.inf)), "block"),
     "samples beyond single precision": (block(np.full((2, 4), 1e300)), "block"),
     "transform of an odd window": (partial(StreamingStft, 2, 511, range(1, 9)), "nfft"),
     "transform of bins above half the rate": (partial(StreamingStft, 2, 512, range(1, 258)), "bins"),
@@ -387,7 +374,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "delay of no number": (delays(spectra=np.full((3, 30, 2), NAN)), "spectra"),
     "covariance of no frames": (partial(covariance, np.zeros((0, 3, 4))), "spectra"),
     "covariance of no number": (partial(covariance, np.full((2, 3, 4), NAN)), "spectra"),
-    "covariance of text": (partial(covariance, [["a"]]), "spectra"),
     "more sources than frames": (partial(signal_subspace, np.ones((2, 3, 4)), 3), "sources"),
     "as many sources as microphones": (partial(signal_subspace, np.ones((9, 3, 4)), 4), "sources"),
     "steering of another array": (
@@ -435,7 +421,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "unknown site": (partial(site, "nowhere"), "nowhere"),
     "unknown sound": (partial(sound_kind, "vuvuzela"), "vuvuzela"),
     "outline of one corner": (partial(OccludingBody, ((0.0, 1.0),)), "corners_m"),
-    "outline of 17 corners": (partial(OccludingBody, tuple((float(i), 1.0) for i in range(17))), "corners_m"),
     "outline that is no number": (partial(OccludingBody, ((0.0, NAN),) * 2), "corners_m"),
     "sound of an unknown kind": (sound(kind="vuvuzela"), "vuvuzela"),
     "gusts without channels": (sound(kind="gusts"), "channels"),
@@ -443,7 +428,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "voice too far away": (sound(kind="voice", place_m=(1e4, 0.0)), "place_m"),
     "route of one point": (sound(kind="steps", route_m=((5.0, 0.0),)), "route_m"),
     "recording too short": (scene(duration_s=0.1), "duration_s"),
-    "recording without a duration": (scene(duration_s=NAN), "duration_s"),
     "vehicle that stands": (scene(speed_mps=0.0), "speed_mps"),
     "approach from above": (scene(approach="above"), "approach"),
     "entry after the end": (scene(entry_s=11.0), "entry_s"),
@@ -452,7 +436,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
         partial(simulate_recording, SimulationSettings(STREET, "none", duration_s=0.5), RNG,
                 MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 3.6]])), r"1\.80 m below"),
     "data set without recordings": (data_set(n_static=0), "n_static"),
-    "data set with a negative count": (data_set(n_dynamic=-1), "n_dynamic"),
     "data set of an unknown scene": (data_set(scene="tunnel"), "scene"),
     "data set of horses": (data_set(kind="horse"), "kind"),
     "drive at a merge": (data_set(scene="merge", n_dynamic=1), "n_dynamic"),

@@ -3,10 +3,6 @@
 import json
 import math
 import re
-import shutil
-import sqlite3
-import struct
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,9 +16,7 @@ from scripted_states import scripted_states, write_states
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.export.other_stacks import autoware_objects
 from worldstate.adapters.export.scene import scene_update
-from worldstate.adapters.ros import message_types
-from worldstate.adapters.ros.bag_writer import bag_writer, state_bag
-from worldstate.adapters.ros.message_types import AUDIO, header
+from worldstate.adapters.ros.bag_writer import state_bag
 from worldstate.cli.main import main
 
 START_NS = 1_700_000_000 * 10**9
@@ -113,19 +107,6 @@ def test_replay_of_folder_and_file_gives_the_written_states(written, bag_of_appr
         assert main(["log", "replay", str(log), "--out", str(tmp_path / "states.jsonl")]) == 0
         assert (tmp_path / "states.jsonl").read_text().splitlines() == [state.to_json() for state in STATES]
     assert "expected snapshots, got none" in refused(["log", "replay", str(bag_of_approach)])
-
-
-def test_messages_have_the_layout_of_cdr(tmp_path):
-    """A header of 4 bytes, then values at multiples of their size, little endian."""
-    samples = np.arange(12, dtype=np.float32)
-    about = {"sample_rate": 8000, "channels": 4, "layout": "interleaved"}
-    with bag_writer(tmp_path / "one", "sqlite3") as write:
-        write("/mics", AUDIO, 1, {"header": header(1_500_000_000), "data": samples} | about)
-    with sqlite3.connect(storage_of(tmp_path / "one")) as database:
-        ((data,),) = database.execute("select data from messages").fetchall()
-    texts = 10, b"base_link", 8000, 4, 12, b"interleaved", 12
-    body = struct.pack("<iII10s2xIH2xI12sI", 1, 500_000_000, *texts) + samples.tobytes()
-    assert data == b"\x00\x01\x00\x00" + body
 
 
 def test_the_bag_of_a_recording_has_the_frames_of_array_and_camera(bag_of_approach):
@@ -225,17 +206,6 @@ def test_a_run_that_fails_leaves_no_bag(tmp_path):
         write(STATES[0])
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
-
-
-def test_without_rosbags_the_extra_is_named(states, tmp_path, monkeypatch, refused):
-    message_types.typestore.cache_clear()
-    monkeypatch.setitem(sys.modules, "rosbags", None)
-    shutil.copy(states, tmp_path / "a.mcap")
-    for words in (
-        ["log", "replay", str(states), "--export", "rosbag=out"],
-        ["run", str(tmp_path / "a.mcap")],
-    ):
-        assert "worldstate[ros]" in refused(words)
 
 
 @pytest.mark.long
