@@ -40,8 +40,9 @@ class Street:
 
     def __init__(self, recording, speed):
         self.samples, self.rate_hz = soundfile.read(recording / "out_multi.wav", dtype="float32")
-        self.images = read_detections(recording / "camera_baseline_results.json").frames
+        self.frames = read_detections(recording / "camera_baseline_results.json").frames
         self.speed, self.begun_s = speed, None
+        self.card = SoundCard(self.samples.shape[1], self)
 
     def wait_until(self, time_s):
         """Wait until so much sound has been played; return whether there is as much."""
@@ -49,57 +50,75 @@ class Street:
             time.sleep(0.002)
         return time_s < len(self.samples) / self.rate_hz
 
+    def __iter__(self):
+        """Yield the sound in blocks for a `SoundCard`."""
+        self.begun_s, length = time.monotonic(), self.card.stream.blocksize
+        for first in range(0, len(self.samples), length):
+            block = self.samples[first : first + length]
+            self.wait_until((first + len(block)) / self.rate_hz)
+            yield block, 0.0, False
+
+    def images(self):
+        """Yield image k at 0.1 k s, with its number in a pixel."""
+        for number in range(len(self.frames)):
+            if not self.wait_until(0.1 * number):
+                return
+            image = np.zeros((1216, 1936, 3), np.uint8)
+            image[0, 0, 0] = number
+            yield image
+
 
 class SoundCard(ModuleType):
-    """Stand-in for sounddevice."""
+    """Stand-in for sounddevice with one device, which gives blocks: samples, time of capture, overflow."""
 
     class PortAudioError(Exception):
         pass
 
-    def __init__(self, street):
+    def __init__(self, channels, blocks=()):
         super().__init__("sounddevice")
-        self.street, self.__spec__ = street, ModuleSpec("sounddevice", None)
+        self.__spec__, self.channels, self.blocks = ModuleSpec("sounddevice", None), channels, blocks
 
     def query_devices(self, device=None, kind=None):
-        one = {"index": 0, "name": "roof", "max_input_channels": self.street.samples.shape[1]}
-        return [one] if kind is None else one
+        known = {"index": 3, "name": "roof array", "max_input_channels": self.channels}
+        if kind is None:
+            return [{"index": 0, "name": "speaker", "max_input_channels": 0}, known]
+        if device not in (None, 3, "roof"):
+            raise ValueError(f"No input device matching {device!r}")
+        return known
 
     def check_input_settings(self, device, channels, dtype, samplerate):
-        assert (channels, samplerate) == (self.street.samples.shape[1], self.street.rate_hz)
+        if channels > self.channels:
+            raise self.PortAudioError("Invalid number of channels")
 
-    def InputStream(self, *, callback, blocksize, **settings):  # noqa: N802 - its name there
-        street, closed = self.street, threading.Event()
+    def InputStream(self, **settings):  # noqa: N802 - its name there
+        closed = threading.Event()
+        self.stream = SimpleNamespace(**settings, start=self.give, close=closed.set, closed=closed)
+        return self.stream
 
-        def play():
-            street.begun_s = time.monotonic()
-            none = SimpleNamespace(inputBufferAdcTime=0.0, currentTime=0.0)
-            for first in range(0, len(street.samples), blocksize):
-                block = street.samples[first : first + blocksize]
-                street.wait_until((first + len(block)) / street.rate_hz)
-                if closed.is_set():
-                    return
-                callback(block, len(block), none, SimpleNamespace(input_overflow=False))
-
-        thread = threading.Thread(target=play, daemon=True)
-        return SimpleNamespace(start=thread.start, close=closed.set)
+    def give(self):
+        stream = self.stream
+        for samples, taken_s, overflow in self.blocks:
+            if stream.closed.is_set():
+                return
+            mine = np.array(samples[:, : stream.channels], np.float32)
+            times = SimpleNamespace(inputBufferAdcTime=taken_s)
+            times.currentTime = taken_s + len(mine) / stream.samplerate + 0.01
+            stream.callback(mine, len(mine), times, SimpleNamespace(input_overflow=overflow))
+            mine[:] = 99.0  # PortAudio writes the next one there
 
 
-class Camera:
-    """Stand-in for VideoCapture of OpenCV: image k at 0.1 k s, its number in a pixel."""
+class Capture:
+    """Stand-in for VideoCapture of OpenCV; a camera without images does not exist."""
 
-    def __init__(self, street):
-        self.street, self.number = street, -1
+    def __init__(self, images):
+        self.images = images
 
     def isOpened(self):  # noqa: N802 - its name there
-        return True
+        return self.images is not None
 
     def read(self):
-        self.number += 1
-        if self.number >= len(self.street.images) or not self.street.wait_until(0.1 * self.number):
-            return False, None
-        image = np.zeros((1216, 1936, 3), np.uint8)
-        image[0, 0, 0] = self.number
-        return True, image
+        image = next(self.images, None)
+        return image is not None, image
 
     def release(self):
         pass
@@ -110,12 +129,14 @@ def stand_in(monkeypatch, recording, speed=2.0):
     street, yolo = Street(recording, speed), ModuleType("ultralytics")
 
     def model(weights):
-        return lambda image, verbose: [Results(street.images[image[0, 0, 0]], ("person", "car"))]
+        return lambda image, verbose: [Results(street.frames[image[0, 0, 0]], ("person", "car"))]
 
     yolo.YOLO = model
-    monkeypatch.setitem(sys.modules, "sounddevice", SoundCard(street))
+    give = street.card.give
+    street.card.give = lambda: threading.Thread(target=give, daemon=True).start()
+    monkeypatch.setitem(sys.modules, "sounddevice", street.card)
     monkeypatch.setitem(sys.modules, "ultralytics", yolo)
-    monkeypatch.setattr("cv2.VideoCapture", lambda device: Camera(street))
+    monkeypatch.setattr("cv2.VideoCapture", lambda device: Capture(street.images()))
 
 
 def free_port(kind=socket.SOCK_DGRAM):
@@ -159,20 +180,12 @@ def played(street, *more):
 def wall(monkeypatch, images=math.inf):
     """Replace cameras: number 0 shows a grey wall at 10 Hz, in so many images; others do not exist."""
 
-    class Capture:
-        def __init__(self, device):
-            self._left = images if device == 0 else -1
-
-        def isOpened(self):  # noqa: N802 - its name there
-            return self._left >= 0
-
-        def read(self):
+    def grey():
+        shown = 0
+        while shown < images:
             time.sleep(0.1)
-            self._left -= 1
-            return (True, np.full((480, 640, 3), 90, np.uint8)) if self._left >= 0 else (False, None)
+            shown += 1
+            yield np.full((480, 640, 3), 90, np.uint8)
 
-        def release(self):
-            pass
-
-    opencv = SimpleNamespace(VideoCapture=Capture)
+    opencv = SimpleNamespace(VideoCapture=lambda device: Capture(None if device else grey()))
     monkeypatch.setattr("worldstate.adapters.live.live_sensors.optional", lambda module: opencv)

@@ -1,10 +1,8 @@
 """Logs of schema 3.x, which version 0.3 wrote, and snapshots without side and risk, through every reader."""
 
-import csv
 import gzip
 import json
 import math
-import runpy
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +18,7 @@ from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.ros.bag_writer import risk_advisories
 from worldstate.adapters.state_log import read_log
 from worldstate.cli.main import main
-from worldstate.operations.recordings.evidence_report import WHY_NOT
 from worldstate.state import RiskCue
-from worldstate.state.world_state import judged
 
 FORMER = Path(__file__).parent / "schema_3"
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
@@ -112,36 +108,6 @@ def test_an_upgrade_that_would_lose_images_or_lie_of_its_form_is_refused(given, 
     former_mcap("watched", tmp_path)
     assert main(["log", "upgrade", str(tmp_path / given), str(tmp_path / named)]) == 2
     assert named in capsys.readouterr().err and not (tmp_path / named).exists()
-
-
-def test_every_consumer_of_an_advisory_is_given_that_it_is_not_usable(tmp_path, capsys):
-    """The same states of an uncalibrated rule, and of one with a budget."""
-    shown = []
-    parts = runpy.run_path(str(EXAMPLES / "own_parts" / "own_parts.py"))
-    for calibrated in (False, True):
-        states = [judged(replace(state, calibrated=calibrated)) for state in scripted_states()]
-        assert any(cue.advisory for cue in states[0].cues)
-        log, page = write_states(tmp_path / "states.jsonl", states), tmp_path / "page.html"
-        with parts["risk_table"](str(tmp_path / "risks.csv")) as export:
-            export(states[0])
-        rows = list(csv.DictReader((tmp_path / "risks.csv").open()))
-        assert main(["log", "view", str(log), "--out", str(page)]) == 0
-        capsys.readouterr()
-        assert main(["explain", str(log), "--side", "left"]) == 0
-        explained = capsys.readouterr().out
-        assert main(["log", "replay", str(log)]) == 0
-        shown.append(
-            {
-                "JSON": '"usable":false,"why_not":["uncalibrated"]' in log.read_text().splitlines()[0],
-                "ROS": not all(one["usable"] for one in risk_advisories(states[0])["advisories"]),
-                "scene": "not usable: uncalibrated" in str(scene_update(states[0])),
-                "page": '"usable":false,"why_not":["uncalibrated"]' in page.read_text(),
-                "table": {row["usable"] for row in rows} == {"False"},
-                "explain": f"usable: no, uncalibrated: {WHY_NOT['uncalibrated']}" in explained,
-                "summary": "in every hop" not in capsys.readouterr().out,
-            }
-        )
-    assert set(shown[0].values()) == {True} and set(shown[1].values()) == {False}, shown
 
 
 def without_model(state: WorldState) -> WorldState:

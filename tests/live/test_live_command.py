@@ -101,15 +101,6 @@ def test_a_local_camera_is_queried(street, tmp_path, monkeypatch, capsys):
     assert looked_at(states) == {"camera"}
 
 
-def test_a_separate_detector_is_queried(street, tmp_path, capsys):
-    states, port = tmp_path / "states.jsonl", free_port()
-    with sending(port, NO_BOXES, b"nonsense"):
-        report = report_of(played(street, "--detections", f"127.0.0.1:{port}", "--out", states), capsys)
-    assert report["detections_refused"] > 0
-    assert "expected" in report["last_refusal"] or "JSON" in report["last_refusal"]
-    assert looked_at(states) == {"camera"}
-
-
 def car_file(folder, street, **more):
     positions_m = np.loadtxt(street / "mics.csv", delimiter=",").tolist()
     (folder / "car.json").write_text(json.dumps({"array": {"positions_m": positions_m}, **more}))

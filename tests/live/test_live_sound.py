@@ -5,12 +5,11 @@ import sys
 import threading
 import time
 from dataclasses import replace
-from importlib.machinery import ModuleSpec
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import soundfile
+from stand_ins import SoundCard
 
 from worldstate.adapters import ListenSettings, listen_steps, open_source
 from worldstate.adapters.audio.sound_file import open_sound
@@ -249,46 +248,10 @@ def test_a_damaged_recording_stops_the_run_with_its_error(source, tmp_path):
 LENGTH = RATE // 40
 
 
-class StandIn:
-    """Stand-in for sounddevice with one device of four channels; it gives these blocks when it starts."""
-
-    class PortAudioError(Exception):
-        pass
-
-    def __init__(self):
-        self.stream, self.blocks = None, []
-
-    def query_devices(self, device=None, kind=None):
-        known = {"index": 3, "name": "roof array", "max_input_channels": 4}
-        speaker = {"index": 0, "name": "speaker", "max_input_channels": 0}
-        if kind is None:
-            return [speaker, known]
-        if device not in (None, 3, "roof"):
-            raise ValueError(f"No input device matching {device!r}")
-        return known
-
-    def check_input_settings(self, device, channels, dtype, samplerate):
-        if channels > 4:
-            raise self.PortAudioError("Invalid number of channels")
-
-    def InputStream(self, **settings):  # noqa: N802 - its name there
-        self.stream = SimpleNamespace(**settings, start=self.give, close=lambda: None)
-        return self.stream
-
-    def give(self):
-        for block, taken_s, overflow in self.blocks:
-            mine = np.array(np.broadcast_to(block, (LENGTH, 4))[:, : self.stream.channels], np.float32)
-            times = SimpleNamespace(inputBufferAdcTime=taken_s, currentTime=taken_s + LENGTH / RATE + 0.01)
-            self.stream.callback(mine, LENGTH, times, SimpleNamespace(input_overflow=overflow))
-            mine[:] = 99.0  # PortAudio writes the next one there
-
-
 @pytest.fixture
 def stand_in(monkeypatch):
-    module = StandIn()
-    module.__spec__ = ModuleSpec("sounddevice", None)
-    monkeypatch.setitem(sys.modules, "sounddevice", module)
-    return module
+    monkeypatch.setitem(sys.modules, "sounddevice", card := SoundCard(4))
+    return card
 
 
 @pytest.fixture
@@ -301,7 +264,8 @@ def noise(stand_in):
 
 def recorded(module, *blocks):
     """Return the sound and samples of blocks: value, time of capture, overflow."""
-    module.blocks, sound = blocks, LiveSound(PortAudioInput(4, RATE, "roof"))
+    module.blocks = [(np.full((LENGTH, 4), value), *about) for value, *about in blocks]
+    sound = LiveSound(PortAudioInput(4, RATE, "roof"))
     chunks = sound.blocks()
     found = [next(chunks)]
     sound.close()

@@ -282,6 +282,7 @@ def test_a_run_with_a_fault_every_second_continues(
     assert logged + lost == report["states"]
     assert (before.stamp_ns - 1_000_000_000) // HOP_NS + 1 == logged + lost + left_out
     assert before.delivery.refused > 0.5 * faults
+    assert {view.sensor for view in before.searched} == {"camera"}
     # An MCAP file that could not be written ends there, until it restarts.
     *_, (_, last) = read_log(tmp_path / "s.mcap")
     assert before.stamp_ns - last.stamp_ns <= 6_000_000_000

@@ -71,7 +71,8 @@ def test_other_readers_find_the_values_of_the_states(written):
         assert message.header.frame_id == "base_link"
         for told, cue in zip(message.advisories, state.cues, strict=True):
             assert (told.direction, told.risk, told.azimuth) == (cue.direction, cue.risk, cue.azimuth_rad)
-            assert told.raised is (cue.advisory is not None)
+            assert (told.raised, told.usable) == (cue.advisory is not None, cue.usable)
+            assert list(told.why_not) == list(cue.why_not)
             within = {float(after): share for after, share in (cue.within or {}).items()}
             assert dict(zip(told.horizon, told.within, strict=True)) == within
             assert list(told.alpha) == ([] if cue.alpha is None else [cue.alpha]), "unknown is empty, not 0"
