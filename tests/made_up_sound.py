@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from plane_waves import noise_from
 
 from worldstate.abduction.evidence import SignatureEvidence
 from worldstate.adapters.files.acoustic_domain import domain_of
@@ -17,12 +18,7 @@ def plane_wave(
     array: MicrophoneArray, rate_hz: float, azimuth_rad: float, seconds: float, seed: int = 3
 ) -> np.ndarray:
     """Return broadband sound from far away with a little noise of every microphone's own, shape (n, M)."""
-    n, rng = round(seconds * rate_hz), np.random.default_rng(seed)
-    spectrum = np.fft.rfft(rng.standard_normal(n))[:, None]
-    delays_s = array.delays_s(azimuth_rad).ravel()
-    late = spectrum * np.exp(-2j * np.pi * np.fft.rfftfreq(n, 1.0 / rate_hz)[:, None] * delays_s)
-    noise = 0.05 * rng.standard_normal((n, array.n_microphones))
-    return (0.05 * (np.fft.irfft(late, n, axis=0) + noise)).astype(np.float32)
+    return 0.05 * noise_from(array, azimuth_rad, rate_hz, seconds, seed, noise=0.05)
 
 
 class Fixed:

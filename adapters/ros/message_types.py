@@ -43,8 +43,10 @@ def typestore() -> Any:
 
 
 def message(name: str, values: Mapping[str, Any]) -> Any:
-    """Return a message of a type; missing fields are zero or empty."""
+    """Return a message of a type; missing fields are zero or empty, and others raise KeyError."""
     store = typestore()
+    if unknown := values.keys() - dict(store.fielddefs[name][1]):
+        raise KeyError(f"{name} has no {', '.join(unknown)}")
     fields = {
         field: _value(kind, values.get(field))
         for field, kind in store.fielddefs[name][1]

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from worldstate_lab.cli.main import main as study
 
 from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.cli.main import main
@@ -30,8 +29,6 @@ def test_commissioning_of_four_microphones_resumes(command, tmp_path, capsys, re
     assert main([*command, *more]) == 0
     assert "unfit for use" in capsys.readouterr().out
     model = read_model(out)
-    assert model.sequence.alarm is not None and len(model.domain.positions_m) == 4
-    assert not model.provenance.fit_for_use
     assert main(["model", "show", str(out)]) == 0
     card = capsys.readouterr().out
     assert "source 1        simulated streets: coefficients; licence: Apache-2.0" in card
@@ -45,27 +42,20 @@ def test_commissioning_of_four_microphones_resumes(command, tmp_path, capsys, re
     assert model.provenance.real == tuple(one for one in shipped if not one.own) != ()
     assert card.count("no real recording of such an array and motion; ") == len(model.provenance.real)
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
-    assert set(told["mounting"]) == {"as mounted", "2 deg of yaw", "5 mm of position"}
     assert told["mounting"]["as mounted"]["detected"] == told["detected"]
-    follow = ["streams", *map(str, (tmp_path / "model.streams").glob("*-200*.npz"))]
-    assert study([*follow, "--model", str(out), "--json"]) == 0
-    passes = json.loads(capsys.readouterr().out)["junctions"]
-    assert passes["all"]["approaches"] >= 1 and 0.0 < passes["all"]["hazard_free_hours"] < 0.1
     heard = {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()}
     before = out.read_bytes()
     assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()} == heard
     assert out.read_bytes() == before
-    boards = ["--array", "respeaker-4", *command[2:4], "--no-exam", "--out", str(tmp_path / "boards")]
-    streams = ["--streams", str(tmp_path / "model.streams"), "--quick"]
-    assert main([*command[:2], *boards, *streams]) == 0
+    boards = ["--array", "respeaker-4", "--out", str(tmp_path / "boards")]
+    assert main([*command, *boards, "--no-exam", "--streams", str(tmp_path / "model.streams")]) == 0
     made = {path.name: path for path in (tmp_path / "boards").iterdir()}
     assert set(made) == {"respeaker-4.json.gz", "mics.json.gz"}
     # The same model except for the card of the omitted exam.
     save_model(out, replace(model, provenance=replace(model.provenance, exam={}, kinds=())))
     assert gzip.decompress(made["mics.json.gz"].read_bytes()) == out.read_bytes() != before
-    other = read_model(made["respeaker-4.json.gz"])
-    assert other.domain.array == "respeaker-4"
+    assert read_model(made["respeaker-4.json.gz"]).domain.array == "respeaker-4"
     quiet = tmp_path / "night.wav"
     noise = np.random.default_rng(1).standard_normal((6000 * 25, 4)) * 0.01
     soundfile.write(quiet, noise, 6000, subtype="FLOAT")
@@ -75,14 +65,6 @@ def test_commissioning_of_four_microphones_resumes(command, tmp_path, capsys, re
     assert told.alarm.onsets_per_hour == 600.0
     # With so little sound no alarm may be reached: the hours are those of the curve.
     assert told.curve.hours == pytest.approx(24.1 / 3600.0) != model.sequence.curve.hours
-
-
-@pytest.mark.slow
-def test_a_moving_ego_has_a_sequence_of_its_own(command, tmp_path):
-    assert main([*command, "--no-exam", "--ego", "moving"]) == 0
-    model = read_model(tmp_path / "model.json")
-    assert model.domain.ego_motion == "moving"
-    assert model.sequence.alarm.onsets_per_hour == 60.0
 
 
 def clips_of(folder: Path, road_user: str) -> list[str]:

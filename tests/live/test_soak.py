@@ -8,21 +8,18 @@ import socket
 import threading
 import time
 from collections import Counter
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_boxes import EMPTY
 from snapshot_laws import broken_laws
 from stand_ins import free_port, send
 
-from worldstate import Odometry
 from worldstate.adapters.files.checkpoint_file import read_checkpoint
 from worldstate.adapters.live import live_listening
-from worldstate.adapters.live.live_sensors import ImageLooks, _code, image_channel, signed
+from worldstate.adapters.live.live_sensors import _code, signed
 from worldstate.adapters.live.live_sound import SoundBlock
 from worldstate.adapters.state_log import read_log
 from worldstate.cli.main import main
@@ -45,8 +42,6 @@ RANGES = (
 )  # fmt: skip
 SPEEDS = ({"speed_mps": 1e30}, {"speed_mps": float("nan")}, {"speed_mps": 1, "x_m": 3}, {"speed_mps": None})
 SAMPLES = np.nan, np.inf, -1e30, 1e6, 0.5
-# Wrong values of a user's callback in place of boxes, and right ones.
-GIVEN = None, RuntimeError("a detector that fails"), "boxes", EMPTY
 
 
 # Blocks that are given in place of one.
@@ -66,16 +61,15 @@ class Faulty:
 
     channels, sample_rate_hz, speed, overflows, name = 4, RATE, 1.0, 0, "faulty"
 
-    def __init__(self, ports: tuple[int, int], websocket: int, key: bytes | None, length_s: float) -> None:
-        self.ports, self.websocket, self._key, self._length_s = ports, websocket, key, length_s
+    def __init__(self, ports: tuple[int, int], key: bytes | None, length_s: float) -> None:
+        self.ports, self._key, self._length_s = ports, key, length_s
         # Blocks between two faults: one second of a long run
         self.every = 40 if length_s > 60.0 else 14
         own = {name[7:]: fault for name, fault in vars(Faulty).items() if name.startswith("_fault_")}
         self.kinds = REPLACED | {name: partial(fault, self) for name, fault in own.items()}
-        self.faults, self.bytes, self.images = Counter[str](), list[int](), image_channel()
+        self.faults, self.bytes = Counter[str](), list[int]()
         self._rng, self._stopped = np.random.default_rng(5), threading.Event()
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._dripping, self._ahead = list[socket.socket](), list[int]()
         self._last, self._incoherent = b"", False
 
     def start(self, into) -> None:
@@ -86,30 +80,7 @@ class Faulty:
         self._stopped.set()
         self._thread.join()
         self._restore()
-        for one in (*self._dripping, self._sender):
-            one.close()
-
-    def detect(self, image):
-        """Fail as a detector of one's own may."""
-        given = GIVEN[int(image[0, 0, 0]) % len(GIVEN)]
-        if isinstance(given, Exception):
-            # A new exception, because a raised one keeps the frames and images of every earlier time.
-            raise type(given)(*given.args)
-        return given
-
-    def beside(self, source, *hand_in):
-        """Yield the steps of a run in which a program of one's own takes looks and odometry, too."""
-        looks, self.sound = ImageLooks(self.images, self, source.sound.stamp_ns, (640, 480)), source.sound
-
-        def tell(listener) -> int:
-            for far_ns in self._ahead[:]:
-                self._ahead.remove(far_ns)
-                stamp_ns = source.sound.stamp_ns(time.monotonic()) + far_ns
-                listener.look(stamp_ns, EMPTY)
-                listener.add(Odometry("far", stamp_ns, 0.0, 0.0))
-            return looks.deliver(listener.look)
-
-        return live_steps(source, *hand_in, tell)
+        self._sender.close()
 
     def _run(self, into) -> None:
         begun_s, number = time.monotonic(), 0
@@ -131,14 +102,10 @@ class Faulty:
                 self._tell(1, ODOMETRY)
             number += 1
 
-    def _tell(self, port: int, record, **told) -> bytes:
+    def _tell(self, port: int, record) -> bytes:
         """Send a record as the detector or the car does; return the datagram."""
-        name, text = ("detections", "odometry")[port], json.dumps(record).encode()
-        if self._key is not None:
-            text = signed(record, self._key, told.get("name", name))
-            if "sent_s" in told:
-                again = json.loads(text.split(b"\n")[0]) | {"sent_s": told["sent_s"]}
-                text = self._coded(json.dumps(again).encode())
+        name = ("detections", "odometry")[port]
+        text = json.dumps(record).encode() if self._key is None else signed(record, self._key, name)
         self._sender.sendto(text, ("127.0.0.1", self.ports[port]))
         return text
 
@@ -146,19 +113,11 @@ class Faulty:
         return text if self._key is None else text + b"\n" + _code(self._key, text)
 
     def _disturb(self) -> None:
-        """Undo the last fault; send rubbish, and ask the websocket as a page and never to the end."""
+        """Undo the last fault, and send rubbish."""
         self.bytes.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
         self._incoherent = False
         self._restore()
         self._rubbish(200)
-        # The server is closed before the microphones.
-        with suppress(OSError):
-            self._dripping.append(socket.create_connection(("127.0.0.1", self.websocket), 5.0))
-            self._dripping[-1].sendall(b"GET / HTTP/1.1\r\n")
-        while len(self._dripping) > 20:
-            self._dripping.pop(0).close()
-        with suppress(OSError), socket.create_connection(("127.0.0.1", self.websocket), 5.0) as page:
-            page.sendall(b"GET / HTTP/1.1\r\nOrigin: https://evil.example\r\n\r\n"[: 7 * self.faults.total()])
 
     def _restore(self) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
@@ -197,14 +156,6 @@ class Faulty:
         for _ in range(20):
             self._sender.sendto(self._last, ("127.0.0.1", self.ports[0]))
 
-    def _fault_datagrams_redirected(self, block):
-        self._tell(0, ODOMETRY, name="odometry")
-        self._tell(1, LOOK, name="detections")
-
-    def _fault_datagrams_of_another_time(self, block):
-        for late_s in (-3600.0, -6.0, 6.0, 3600.0, 1e308):
-            self._tell(0, LOOK, sent_s=time.time() + late_s)
-
     def _fault_flood(self, block):
         self._rubbish(5_000)
 
@@ -216,17 +167,6 @@ class Faulty:
         os.link("s.jsonl", f"kept/{number}.jsonl")  # so that all of its states can be read at the end
         for name in ("s.jsonl", "s.mcap"):
             Path(name).unlink()
-
-    def _fault_callbacks(self, block):
-        for value in range(len(GIVEN)):
-            self.images.put((time.monotonic(), np.full((480, 640, 3), value, np.uint8)))
-        self.images.put((time.monotonic(), None))
-
-    def _fault_far_ahead(self, block):
-        self._ahead += [3_600_000_000_000, 10**18, -3_600_000_000_000]
-
-
-live_steps = live_listening.live_steps
 
 
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
@@ -241,22 +181,28 @@ live_steps = live_listening.live_steps
 def test_a_run_with_a_fault_every_second_continues(
     length_s, key, street, tmp_path, capsys, caplog, monkeypatch
 ):
-    ports, websocket = (free_port(), free_port()), free_port(socket.SOCK_STREAM)
-    feed = Faulty(ports, websocket, key, length_s)
+    ports = free_port(), free_port()
+    feed = Faulty(ports, key, length_s)
     monkeypatch.setattr("worldstate.adapters.live.live_sound.PortAudioInput", lambda *given: feed)
-    monkeypatch.setattr(live_listening, "live_steps", feed.beside)
+    sounds, live_steps = [], live_listening.live_steps
+
+    def steps_of(source, *hand_in):
+        sounds.append(source.sound)
+        return live_steps(source, *hand_in)
+
+    monkeypatch.setattr(live_listening, "live_steps", steps_of)
     (tmp_path / "key").write_bytes(SECRET)
     (tmp_path / "kept").mkdir()
     given = f"--array {street}/mics.csv --camera {street}/lens.json --rate {RATE} --uncalibrated"
     told = f"--detections 127.0.0.1:{ports[0]} --odometry 127.0.0.1:{ports[1]} {'--key key' if key else ''}"
     kept = "--out s.jsonl --export mcap=s.mcap --save-state belief.json"
-    ends = f"--export foxglove={websocket} --duration {length_s} --json"
+    ends = f"--duration {length_s} --json"
     monkeypatch.chdir(tmp_path)
     assert main(["live", *given.split(), *told.split(), *kept.split(), *ends.split()]) == 0
     printed = capsys.readouterr()
     report, faults = json.loads(printed.out), feed.faults.total()
     lost = sum(int(one) for one in re.findall(r"s\.jsonl: (\d+) records were lost", caplog.text))
-    left_out = feed.sound.start_ns // HOP_NS
+    left_out = sounds[0].start_ns // HOP_NS
     used_mib = [used >> 20 for used in feed.bytes]
     figures = {"faults": feed.faults, "records lost": lost, "hops left out": left_out}
     figures["MiB every tenth of the time"] = [*used_mib[:: len(used_mib) // 10], max(used_mib)]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import soundfile
-from passing_boxes import CAMERA, EDGE_RAD, LANE_M, passing
+from camera_boxes import CAMERA, EDGE_RAD, LANE_M, passing
 
 from worldstate.adapters.camera.detections import DetectionFilter, DetectionFrame, DetectionLog
 from worldstate.adapters.datasets.feature_extraction import read_labels
