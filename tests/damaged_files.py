@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 from bag_messages import RATE_HZ, bag_of, blocks, sound_of
+from hop_tables import blank_stream
 from scripted_states import scripted_states, write_states
 
 from worldstate import WorldFilter, WorldState
@@ -22,7 +23,7 @@ from worldstate.adapters.files.model_file import read_model, save_model
 from worldstate.adapters.ros.bag_writer import state_bag
 from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.operations.labelling.street_passes import write_street
-from worldstate.operations.recordings.hop_table import HopTable, save_tables
+from worldstate.operations.recordings.hop_table import save_tables
 from worldstate.simulation.dataset.dataset import LogRow, write_log
 from worldstate.smoothing.learned_street import LearnedStreet
 
@@ -128,13 +129,7 @@ def _write_street(folder: Path) -> None:
 
 
 def _write_tables(folder: Path, rng: np.random.Generator) -> None:
-    columns = {
-        "time_s": 1.0 + 0.1 * np.arange(30), "log_likelihoods": np.zeros((30, 4)),
-        "answer": np.zeros(30, np.int64), "miss_rate": np.ones(30), "clutter_rate": np.zeros(30),
-        "approach": np.full(30, np.nan),
-        "seen": np.zeros(30, bool), "there": np.zeros(30, bool),
-    }  # fmt: skip
-    save_tables(folder / "streams.npz", [HopTable(columns, name="a")])
+    save_tables(folder / "streams.npz", [blank_stream("a", 30)])
     labels = np.array(["none", "left", "front", "right"])
     table = FeatureTable(rng.random((4, 60)), labels, labels, np.repeat("SA1", 4), labels, (None, 7, 7, 7))
     write_features(folder / "table.csv", table)

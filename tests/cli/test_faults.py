@@ -65,6 +65,10 @@ def files(tmp_path, monkeypatch) -> Path:
         Path(name).mkdir(parents=True)
     Path("link.wav").symlink_to("a.wav")
     Path("loop").symlink_to("loop")
+    camera = {"name": "front", "width_px": 640, "height_px": 480, "horizontal_fov_deg": 90}
+    camera |= {"position_m": [0, 0, 0], "detections": "boxes.json"}
+    Path("car.json").write_text(json.dumps({"cameras": [camera]}))
+    Path("boxes.json").touch()
     os.mkfifo("pipe")
     return tmp_path
 
@@ -96,6 +100,11 @@ def files(tmp_path, monkeypatch) -> Path:
         ("demo --out a.wav/demo", "a.wav"),
         ("demo --out taken", "taken/timeline.png: expected a file"),
         ("sim make --out a.wav", "a.wav"),
+        # Boxes belong to one recording.
+        ("array align a.wav link.wav --car car.json", "expected one recording with --detections or --car"),
+        ("array align a.wav link.wav --detections boxes.json", "expected one recording with --detections"),
+        ("street learn a.wav link.wav --car car.json --out s.json", "expected one recording with"),
+        ("street learn a.wav link.wav --detections boxes.json --out s.json", "expected one recording with"),
         # Options without effect
         ("demo --out new --seed -1", "--seed: expected"),
         ("model fit t.csv --seed -1 --out m2.json", "--seed: expected"),
@@ -124,20 +133,6 @@ def files(tmp_path, monkeypatch) -> Path:
 )
 def test_bad_outputs_and_options_without_effect_raise_an_error_before_the_work(line, named, files, capsys):
     assert named in refusal(line.split(), files, capsys)
-
-
-def test_boxes_need_one_recording(tmp_path, capsys):
-    """A camera of a car file may name detections, which belong to one recording."""
-    camera = {"name": "front", "width_px": 640, "height_px": 480, "horizontal_fov_deg": 90}
-    camera |= {"position_m": [0, 0, 0], "detections": "boxes.json"}
-    (tmp_path / "car.json").write_text(json.dumps({"cameras": [camera]}))
-    for name in ("a.wav", "b.wav", "boxes.json"):
-        (tmp_path / name).touch()
-    several = [str(tmp_path / name) for name in ("a.wav", "b.wav")]
-    for command in (["array", "align"], ["street", "learn", "--out", str(tmp_path / "s.json")]):
-        for given in (["--car", "car.json"], ["--detections", "boxes.json"]):
-            words = [*command, *several, given[0], str(tmp_path / given[1])]
-            assert "expected one recording with --detections or --car" in refusal(words, tmp_path, capsys)
 
 
 def test_reference_boxes_need_one_video(tmp_path, capsys):
@@ -323,18 +318,18 @@ def test_a_second_simulation_keeps_the_recordings_of_the_log(tmp_path):
 
 
 @contextmanager
-def within(seconds: float):
+def within(seconds: int):
     """Raise TimeoutError if the block takes longer."""
 
     def end(number: int, frame: object) -> None:
         raise TimeoutError
 
     before = signal.signal(signal.SIGALRM, end)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.alarm(seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
 
 
@@ -376,7 +371,7 @@ def test_pipes_devices_and_nul_names_raise_an_error_at_once(line, real, capsys):
     if (car := PIPES[line]) is not None:
         Path("car.json").write_text(json.dumps(car))
         line = "run real.wav --car car.json --uncalibrated"
-    with within(20.0):
+    with within(20):
         said = refusal(line.split(), real, capsys)
     assert "device or pipe" in said or "null byte" in said
 
