@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from street_measurements import EVEN, car, hop, reading
+from street_measurements import ABSENT, EVEN, PRESENT, car, hop, reading
 
 from worldstate import Measurement
-from worldstate.abduction.co_evidence import Absent, CoEvidence, Present
+from worldstate.abduction.co_evidence import CoEvidence
 from worldstate.abduction.sequence.sequence_model import GROUPS, SequenceAlarm
 from worldstate.measurement import Look
 
@@ -25,22 +25,20 @@ def heard(number: int, loud: str | None, answer: CoEvidence, level: float = 20.0
         weights[1 - side, GROUPS.index("other")] += level
     said = replace(reading(weights, share=EVEN), alarm=ALARM)
     at, nats = START_NS // HOP_NS + number, (-1.0, -1.0, -1.0, 1.0)
-    look = Look("camera", at * HOP_NS, answer)
-    return hop(at, nats, answer=answer, look=look, sequence=said)
+    return hop(at, nats, answer=answer, look=Look("camera", at * HOP_NS, answer), sequence=said)
 
 
 def false_alarms(hops: int = 500) -> Iterator[Measurement]:
     """Yield a false alarm of 0.4 s every 4 s on alternating sides."""
     for number in range(1, hops):
         side = SIDES[number // 40 % 2] if number % 40 < 4 else None
-        yield heard(number, side, Absent(0.04, 0.01))
+        yield heard(number, side, ABSENT)
 
 
 def arrival(first: int, level: float = 20.0) -> Iterator[Measurement]:
     """Yield a vehicle that is audible on the left for 2 s and then in view."""
     for number in range(100):
-        seen = 80 <= number < 92
-        answer = (Present if seen else Absent)(0.04, 0.01)
-        one = heard(first + number, "left" if 60 <= number < 80 else None, answer, level)
+        seen, loud = 80 <= number < 92, "left" if 60 <= number < 80 else None
+        one = heard(first + number, loud, PRESENT if seen else ABSENT, level)
         boxes = (car(0.53 - 0.04 * (number - 80)),) if seen else ()
         yield replace(one, sightings=boxes)
