@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from worldstate.adapters.audio.sound_file import RawPcm, open_sound
 from worldstate.adapters.ros.bag_input import read_beside, read_sound
 from worldstate.adapters.ros.bag_writer import bag_writer
 from worldstate.adapters.ros.message_types import AUDIO, DETECTIONS, ODOMETRY, header
@@ -25,6 +26,14 @@ def read_bag(path: Path) -> SimpleNamespace:
     sound, array = read_sound(path)
     detections, ego = read_beside(sound)
     return SimpleNamespace(sound=sound, array=array, detections=detections, ego=ego)
+
+
+def heard(path: Path, channels: int | None = CHANNELS, stated: RawPcm | None = None) -> np.ndarray:
+    """Return the sound of a bag, (n, M) of full scale 1."""
+    with open_sound(read_sound(path, None, stated)[0], channels) as audio:
+        found = np.concatenate(list(audio.blocks()))
+        assert audio.frames == len(found)
+    return found
 
 
 def sound_of(n_samples: int) -> np.ndarray:

@@ -27,16 +27,9 @@ from scripted_states import EGO, scripted_states, write_states
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.sync.client import connect
 
-from worldstate.adapters.export import foxglove_server
+from worldstate.adapters.export import foxglove_server, log_messages
 from worldstate.adapters.export.foxglove_server import OriginGate, live_server
-from worldstate.adapters.export.log_messages import (
-    image_message,
-    recorded_sound,
-    rerun_file,
-    sound_message,
-    srp_message,
-    state_messages,
-)
+from worldstate.adapters.export.log_messages import state_messages
 from worldstate.adapters.export.scene import scene_update
 from worldstate.adapters.state_log import read_log
 from worldstate.cli.main import main
@@ -153,13 +146,13 @@ def test_foxglove_parses_every_field_by_its_own_definitions():
     scene_class, image_class, frame_class = map(of_foxglove, names)
     srp = np.linspace(1.0, 2.0, AZIMUTHS.size)
     for state in STATES:
-        for message in (*list(state_messages(state))[1:], srp_message(state, AZIMUTHS, srp)):
+        for message in (*list(state_messages(state))[1:], log_messages.srp_message(state, AZIMUTHS, srp)):
             kind = {"foxglove.FrameTransform": frame_class}.get(message.schema_name, scene_class)
             json_format.Parse(json.dumps(as_protobuf_json(json.loads(message.data))), kind())
-    sound = json.loads(sound_message(10**9, np.array([0.5, -1.0, 2.0], np.float32), 8000).data)
+    sound = json.loads(log_messages.sound_message(10**9, np.array([0.5, -1.0, 2.0], np.float32), 8000).data)
     samples = json_format.Parse(json.dumps(as_protobuf_json(sound)), of_foxglove("RawAudio")()).data
     assert np.frombuffer(samples, "<i2").tolist() == [16384, -32768, 32767]
-    image = json.loads(image_message(1_500_000_000, b"\xff\xd8\xff").data)
+    image = json.loads(log_messages.image_message(1_500_000_000, b"\xff\xd8\xff").data)
     assert json_format.Parse(json.dumps(as_protobuf_json(image)), image_class()).data == b"\xff\xd8\xff"
 
 
@@ -168,7 +161,7 @@ def test_the_sound_of_a_log_is_that_of_the_first_microphone_that_hears(tmp_path)
     heard[::2, 1:] *= -1.0
     heard[:, 2] = 0.25 * heard[:, 1]
     soundfile.write(tmp_path / "a.wav", heard, 8000, subtype="FLOAT")
-    with recorded_sound(tmp_path / "a.wav") as sound_until:
+    with log_messages.recorded_sound(tmp_path / "a.wav") as sound_until:
         (first,) = sound_until(100_000_000)
     samples = np.frombuffer(base64.b64decode(json.loads(first.data)["data"]), "<i2")
     assert samples[:2].tolist() == [-16384, 16384]
@@ -260,9 +253,9 @@ def test_a_rerun_recording_has_the_scene_the_power_and_the_images(tmp_path):
         assert any(path.startswith(below) for path in paths), name
     for kind in ("Mesh3D:triangle_indices", "LineStrips3D:strips", "Points3D:labels", "Clear:is_recursive"):
         assert kind in printed
-    with rerun_file(out) as write:
-        write(srp_message(STATES[0], AZIMUTHS, np.ones(181)))
-        write(image_message(10**9, b"\xff\xd8\xff\xe0 a jpeg"))
+    with log_messages.rerun_file(out) as write:
+        write(log_messages.srp_message(STATES[0], AZIMUTHS, np.ones(181)))
+        write(log_messages.image_message(10**9, b"\xff\xd8\xff\xe0 a jpeg"))
     printed = printed_by_rerun(out)
     assert "/worldstate/srp/srp/lines" in printed
     assert re.search(r"/camera/image - .*EncodedImage:blob", printed)
@@ -339,10 +332,7 @@ def test_a_port_that_is_taken_is_named():
     ("origins", "taken"),
     [
         ([], True),
-        (["http://localhost:8080"], True),
         (["https://app.foxglove.dev"], True),
-        (["https://evil.example"], False),
-        (["null"], False),
         (["http://localhost", "https://evil.example"], False),
         (["https://app.foxglove.dev.evil.example"], False),
     ],

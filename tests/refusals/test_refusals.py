@@ -11,16 +11,10 @@ import numpy as np
 import pytest
 from hop_tables import blank_stream
 
-from worldstate import Context, Listener, Measurement, NotUsable, Sighting, SignatureEvidence, WorldFilter
+from worldstate import Context, Listener, NotUsable, SignatureEvidence, WorldFilter, measurement, simulation
 from worldstate.abduction.co_evidence import Absent, MissRateTable, default_miss_rates, isotonic_grid
+from worldstate.abduction.cueing import risk_map
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy, neyman_pearson_threshold
-from worldstate.abduction.cueing.risk_map import (
-    IsotonicMap,
-    PlattMap,
-    brier_score,
-    expected_calibration_error,
-    fit_isotonic,
-)
 from worldstate.abduction.evidence import SideEvidence, abduce, statistic
 from worldstate.abduction.grounding import grounded_likelihood as grounding
 from worldstate.abduction.road_users import DomainGuard
@@ -53,29 +47,10 @@ from worldstate.frontend.spectra.stft import StreamingStft
 from worldstate.ground.errors import InvalidArgumentError, WorldstateError
 from worldstate.ground.serialisation import decode
 from worldstate.ground.values import nanoseconds
-from worldstate.measurement import (
-    Approach,
-    Bearing,
-    CameraLook,
-    Look,
-    Position,
-    PositionScan,
-    SearchedSector,
-    Sector,
-)  # fmt: skip
 from worldstate.operations.calibration.cueing_calibration import calibrate_cueing, correlation_time_hops
 from worldstate.operations.recordings.channel_report import rate_from_duration
 from worldstate.operations.recordings.hop_table import hop_stream
 from worldstate.operations.viewing.log_page import page_data
-from worldstate.simulation import (
-    DatasetSettings,
-    SimulationSettings,
-    SoundSettings,
-    draw_settings,
-    place,
-    simulate_recording,
-    site,
-)  # fmt: skip
 from worldstate.simulation.scene.kinds import vehicle_kind
 from worldstate.simulation.scene.occluders import OccludingBody
 from worldstate.simulation.scene.settings import sound_kind
@@ -93,9 +68,14 @@ STUMP = {
     **{"value": [[0.0, -1.0, 1.0]], "tree_class": [0], "baseline": [0.0, 0.0]},
 }
 EMPTY, GREY = DetectionFrame(np.empty((0, 4)), np.empty(0), ()), np.full((40, 60, 3), 90, np.uint8)
-CAR, LOOK = Sighting(0.1, 0.02, "car", 0.9), Look("camera", 10**8, Absent(0.04), (-0.5, 0.5))
+CAR, LOOK = (
+    measurement.Sighting(0.1, 0.02, "car", 0.9),
+    measurement.Look("camera", 10**8, Absent(0.04), (-0.5, 0.5)),
+)
 READING = SequenceReading(np.stack([SHARE, SHARE]), SHARE)
-HOP = Measurement(10**8, SignatureEvidence(SIDES, (4.0, 0.0), 2.0, 0.0), Absent(0.04), OFF, OFF, (CAR,))
+HOP = measurement.Measurement(
+    10**8, SignatureEvidence(SIDES, (4.0, 0.0), 2.0, 0.0), Absent(0.04), OFF, OFF, (CAR,)
+)
 LIKELIHOODS = {
     "a likelihood of None": (None, 0.0),
     "a likelihood of text": ("a", 0.0),
@@ -110,7 +90,7 @@ PAIR, POLE = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [[0, 0, 0], [0, 0, 1.
 SEVEN = MicrophoneArray(ovad_array().positions_m[::8])
 TIMES_S, BAND_HZ = np.arange(-0.95, 0.0, 0.1), np.arange(300.0, 1800.0, 50.0)
 AHEAD_RAD, QUIET = np.radians(np.linspace(-90.0, 90.0, 180)), np.full((3, 180), 0.2)
-STREET = site("SA1")
+STREET = simulation.site("SA1")
 STREAM = StreamSettings(STREET, 1.0)
 
 
@@ -120,20 +100,20 @@ def call_of(function, *given, **usual):
 
 
 misses = call_of(MissRateTable, azimuth_deg=(0, 30), degradation=(0, 1))
-policy = call_of(replace, CueingPolicy(0.78, 3, 0.02, (0.25,) * 4, PlattMap(-1.0, 0.0)))
+policy = call_of(replace, CueingPolicy(0.78, 3, 0.02, (0.25,) * 4, risk_map.PlattMap(-1.0, 0.0)))
 threshold = call_of(neyman_pearson_threshold, alpha=0.1)
 signature, window = call_of(replace, MODEL.signature), call_of(MODEL.signature.predict_proba)
 prior = call_of(abduce, evidence=TWO, co_evidence=Absent(0.1))
 camera, degraded = call_of(PinholeCamera.ovad), call_of(camera_health.degrade, rng=RNG)
 trees, hop = call_of(BoostedTrees, **STUMP), call_of(replace, HOP)
 grounded = call_of(grounding.ground, ONE, grounding.GroundedObservation())
-position = call_of(Position, position_m=(1.0, 0.0), covariance=((1.0, 0.0), (0.0, 1.0)))
+position = call_of(measurement.Position, position_m=(1.0, 0.0), covariance=((1.0, 0.0), (0.0, 1.0)))
 bearing_bound = call_of(cramer_rao.bearing_crb_rad2, frequencies_hz=1e3, snr=1.0, snapshots=1)
 feature = call_of(published_feature, array=SEVEN, sample_rate_hz=47_998)
 delays = call_of(gcc_delays, spectra=np.ones((3, 30, 2)), frequencies_hz=BAND_HZ, max_delay_s=1e-3)
 spectra = call_of(GivenSpectra, values=QUIET, azimuths_rad=AHEAD_RAD, array=SEVEN)
-scene = call_of(SimulationSettings, site=STREET, approach="left")
-data_set, sound = call_of(DatasetSettings), call_of(SoundSettings)
+scene = call_of(simulation.SimulationSettings, site=STREET, approach="left")
+data_set, sound = call_of(simulation.DatasetSettings), call_of(simulation.SoundSettings)
 
 
 def fitted(width, labels):
@@ -158,7 +138,7 @@ def heard_at(rate):
 
 
 def searched(half_width_rad, range_m=10.0):
-    return lambda: SearchedSector(Sector(0.0, half_width_rad), range_m, 0.5)
+    return lambda: measurement.SearchedSector(measurement.Sector(0.0, half_width_rad), range_m, 0.5)
 
 
 def front_end(rate_hz, array=SQUARE, **settings):
@@ -204,9 +184,9 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "policy with a budget of one": (policy(alpha=1.0), "alpha"),
     "policy with a prior of two classes": (policy(reference_prior=(0.5, 0.5)), "reference_prior"),
     "policy with a miss rate above one": (policy(miss_rate=2.0), "miss_rate"),
-    "risk map that falls": (partial(PlattMap, 1.0, 0.0), "slope"),
-    "risk map with statistics that fall": (partial(IsotonicMap, (0.5, 0.1), (0.0, 1.0)), "do not fall"),
-    "risk map with a risk above one": (partial(IsotonicMap, (0.1, 0.5), (0.0, 1.5)), "risks"),
+    "risk map that falls": (partial(risk_map.PlattMap, 1.0, 0.0), "slope"),
+    "risk map of falling statistics": (partial(risk_map.IsotonicMap, (0.5, 0.1), (0.0, 1.0)), "do not fall"),
+    "risk map with a risk above one": (partial(risk_map.IsotonicMap, (0.1, 0.5), (0.0, 1.5)), "risks"),
     "prior of two explanations for four": (prior([0.0, 0.0]), "log_prior"),
     "prior that is no number": (prior([0.0, 0.0, NAN, 0.0]), "log_prior"),
     "prior that excludes everything": (prior([-math.inf] * 4), "log_prior"),
@@ -279,10 +259,10 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     **{f"sound at {rate} Hz": (heard_at(rate), f"at least 6000 Hz, got {rate} Hz")
        for rate in (3_000, 5_800)},
     # Measurements, checkpoints and times of the filter
-    "bearing with a spread of zero": (partial(Bearing, 0.1, 0.0), "std_rad: expected a number .* got 0.0"),
+    "bearing with a spread of zero": (partial(measurement.Bearing, 0.1, 0.0), "std_rad: .* got 0.0"),
     "sighting of None": (hop(sightings=(CAR, None)), r"sightings\[1\]: expected Sighting"),
     "33 further cameras": (
-        hop(look=LOOK, further=(CameraLook(LOOK),) * 33), "further: expected at most 32, got 33"),
+        hop(look=LOOK, further=(measurement.CameraLook(LOOK),) * 33), "further: expected at most 32, got 33"),
     "box beyond half a turn": (partial(replace, CAR, azimuth_rad=4.0), "azimuth_rad"),
     **{f"{name} in evidence": (partial(SignatureEvidence, SIDES, bad, 0.0, 0.0), "hidden")
        for name, bad in LIKELIHOODS.items()},
@@ -297,8 +277,8 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "class with a share of two": (position(classes=(("car", 2.0),)), "classes"),
     "search of more than a turn": (searched(9.0), "half_width_rad"),
     "search of a negative range": (searched(1.0, range_m=-1.0), "range_m"),
-    "scan without a source": (partial(PositionScan, "", 0), "source: expected a name"),
-    "129 positions": (partial(PositionScan, "radar", 0, (position()(),) * 129), "positions: .* 128"),
+    "scan without a source": (partial(measurement.PositionScan, "", 0), "source: expected a name"),
+    "129 positions": (partial(measurement.PositionScan, "a", 0, (position()(),) * 129), "positions: .* 128"),
     "ego speed that is no number": (partial(Context, ego_speed_mps=NAN), "ego_speed_mps"),
     "reading of one side": (partial(replace, READING, groups=READING.groups[:1]), "groups"),
     "number as a reading": (hop(sequence=0.5), "sequence: expected .*NotUsable"),
@@ -403,9 +383,9 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "broadside of a vertical line": (partial(cramer_rao.broadside_rad, POLE), "horizontal extent"),
     "information of a vertical line": (
         partial(cramer_rao.endfire_information, POLE, 0.0), "horizontal extent"),
-    "risk above one": (partial(expected_calibration_error, [0.5, 1.2], [True, False]), "risk"),
-    "no risks": (partial(brier_score, [], []), "risk"),
-    "risk map without a hazard-free sample": (partial(fit_isotonic, [0.1, 0.2], [True, True]), "hazard"),
+    "risk above one": (partial(risk_map.expected_calibration_error, [0.5, 1.2], [True, False]), "risk"),
+    "no risks": (partial(risk_map.brier_score, [], []), "risk"),
+    "risk map of hazards only": (partial(risk_map.fit_isotonic, [0.1, 0.2], [True, True]), "hazard"),
     "correlation time of no windows": (partial(correlation_time_hops, []), "window"),
     "stream without hops": (partial(hop_stream, [], name="a"), "hop"),
     "calibration on hazards only": (
@@ -413,12 +393,12 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
                                  (0.3, 0.3, 0.2, 0.2), MODEL.policies), "without a hazard"),
     "forgetting of a negative time": (partial(forgotten, LearnedStreet("Elm Street"), -1.0), "-1"),
     "page of no states": (partial(page_data, []), "at least one snapshot"),
-    "smoothing from an approach": (partial(smooth, Approach(0.1, 0.1)), "bearing or position"),
-    "track of an unknown entity": (partial(smooth, Bearing(0.1, 0.1)), "'unknown'"),
+    "smoothing from an approach": (partial(smooth, measurement.Approach(0.1, 0.1)), "bearing or position"),
+    "track of an unknown entity": (partial(smooth, measurement.Bearing(0.1, 0.1)), "'unknown'"),
     # Simulation
     "unknown vehicle": (partial(vehicle_kind, "nowhere"), "nowhere"),
-    "unknown place": (partial(place, "nowhere"), "nowhere"),
-    "unknown site": (partial(site, "nowhere"), "nowhere"),
+    "unknown place": (partial(simulation.place, "nowhere"), "nowhere"),
+    "unknown site": (partial(simulation.site, "nowhere"), "nowhere"),
     "unknown sound": (partial(sound_kind, "vuvuzela"), "vuvuzela"),
     "outline of one corner": (partial(OccludingBody, ((0.0, 1.0),)), "corners_m"),
     "outline that is no number": (partial(OccludingBody, ((0.0, NAN),) * 2), "corners_m"),
@@ -431,9 +411,9 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "vehicle that stands": (scene(speed_mps=0.0), "speed_mps"),
     "approach from above": (scene(approach="above"), "approach"),
     "entry after the end": (scene(entry_s=11.0), "entry_s"),
-    "approach that the place lacks": (partial(draw_settings, "SM1", "right", RNG), "approach"),
+    "approach that the place lacks": (partial(simulation.draw_settings, "SM1", "right", RNG), "approach"),
     "microphone below the road": (
-        partial(simulate_recording, SimulationSettings(STREET, "none", duration_s=0.5), RNG,
+        partial(simulation.simulate_recording, scene(approach="none", duration_s=0.5)(), RNG,
                 MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 3.6]])), r"1\.80 m below"),
     "data set without recordings": (data_set(n_static=0), "n_static"),
     "data set of an unknown scene": (data_set(scene="tunnel"), "scene"),
@@ -443,8 +423,8 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "background limits out of order": (partial(Traffic, "t", {}, background_db=(3.0, 2.0)), "background_db"),
     "rain share above one": (partial(Traffic, "t", {}, rain_share=1.5), "rain_share"),
     "unknown flow": (partial(Traffic, "t", {"up": 3.0}), "per_hour"),
-    "drive of wrong duration": (partial(StreamSettings, site("DA1"), 1.1), "minutes"),
-    "stream at a merge": (partial(StreamSettings, place("merge").site, 1.0), "junction"),
+    "drive of wrong duration": (partial(StreamSettings, simulation.site("DA1"), 1.1), "minutes"),
+    "stream at a merge": (partial(StreamSettings, simulation.place("merge").site, 1.0), "junction"),
     "stream too long": (partial(replace, STREAM, minutes=1000.0), "minutes"),
 }  # fmt: skip
 

@@ -3,15 +3,14 @@
 import io
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_messages import Message, bag_of, block, box, image, info, moved, pcm, read_bag, sound_of
+from bag_messages import Message, bag_of, block, box, heard, image, info, moved, pcm, read_bag, sound_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from worldstate.adapters.audio.sound_file import RawPcm, open_sound
+from worldstate.adapters.audio.sound_file import RawPcm
 from worldstate.adapters.ros.bag_input import is_bag, read_sound
 from worldstate.adapters.ros.sample_clock import begins_again, contradiction, lost_before
 from worldstate.cli.main import main
@@ -130,13 +129,6 @@ def begins(step: int) -> IntArray:
     return T0 + np.arange(-(-SOUND.nbytes // step)) * step * SECOND // (8 * 8000)
 
 
-def heard(path: Path, stated: RawPcm | None = None) -> np.ndarray:
-    with open_sound(read_sound(path, None, stated)[0], 4) as audio:
-        found = np.concatenate(list(audio.blocks()))
-        assert audio.frames == len(found)
-    return found * 2**15
-
-
 @pytest.mark.parametrize("kind", [*KINDS, "zero", "a loop"])
 def test_every_sample_of_a_bag_is_read(kind, tmp_path, caplog):
     stamps = late(kind, 600, 10 * MS, np.random.default_rng(3))
@@ -145,7 +137,7 @@ def test_every_sample_of_a_bag_is_read(kind, tmp_path, caplog):
     elif kind == "a loop":
         stamps = np.tile(stamps[:300], 2)
     path = bag_of(tmp_path / "bag", spoken(stamps, even(600)[0] + 3 * MS))
-    np.testing.assert_array_equal(heard(path), SOUND)
+    np.testing.assert_array_equal(heard(path) * 2**15, SOUND)
     assert "missing" not in caplog.text
     assert ("begin again at 3.000 s" in caplog.text) is (kind == "a loop")
 
@@ -153,7 +145,7 @@ def test_every_sample_of_a_bag_is_read(kind, tmp_path, caplog):
 @pytest.mark.parametrize("step", [101, 1001, 1277, 4099])
 def test_samples_may_be_split_between_messages(step, tmp_path, caplog):
     path = bag_of(tmp_path / "whole", spoken(begins(step), step=step))
-    np.testing.assert_array_equal(heard(path), SOUND)
+    np.testing.assert_array_equal(heard(path) * 2**15, SOUND)
     assert not caplog.text
 
 
@@ -162,7 +154,7 @@ def test_a_lost_message_does_not_shift_channels(step, tmp_path):
     """Messages may split samples; later samples keep their channels."""
     messages = [*spoken(begins(step), step=step)]
     del messages[41:44]
-    found = heard(bag_of(tmp_path / "bag", messages))
+    found = heard(bag_of(tmp_path / "bag", messages)) * 2**15
     assert len(found) == len(SOUND)
     same = (found == SOUND).all(axis=1)
     assert same[: 40 * step // 8 - 1].all() and same[43 * step // 8 + 1 :].all()
@@ -238,7 +230,7 @@ def test_the_audio_format_can_be_given(tmp_path, capsys, refused):
     with pytest.raises(InputFileError, match=r"AudioInfo.* or --topic audio=.*:RATE:CHANNELS:FORMAT"):
         read_sound(bare)
     for path in (bare, wrong):
-        np.testing.assert_array_equal(heard(path, FORMAT), SOUND)
+        np.testing.assert_array_equal(heard(path, stated=FORMAT) * 2**15, SOUND)
         words = ["array", "bearings", str(path), "--array", str(array), "--out", str(tmp_path / "b.csv")]
         assert main([*words, "--topic", "audio=:8000:4:s16"]) == 0
         assert len((tmp_path / "b.csv").read_text().splitlines()) == 52
@@ -254,7 +246,7 @@ def test_incomplete_bags_are_read_or_name_the_command_that_mends_them(storage, w
     path = bag_of(tmp_path / "bag", spoken(even(600)[0]), storage)
     (path / "metadata.yaml").unlink()
     assert is_bag(path)
-    np.testing.assert_array_equal(heard(path), SOUND)
+    np.testing.assert_array_equal(heard(path) * 2**15, SOUND)
     assert "metadata.yaml is missing, `ros2 bag reindex` writes it" in caplog.text
     (file,) = path.iterdir()
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
@@ -269,7 +261,7 @@ def test_24_bit_samples_in_four_bytes_are_detected(tmp_path):
     wide = np.random.default_rng(2).normal(0.0, 1e5, (16_000, 4)).astype("<i4")
     stamps, each = T0 + np.arange(20) * TENTH_NS, {"step": 12_800, "data": wide.tobytes()}
     right = bag_of(tmp_path / "right", spoken(stamps, **each, sample_format="S24_32LE"))
-    np.testing.assert_allclose(heard(right) * 256, wide, atol=1e-2)
+    np.testing.assert_allclose(heard(right) * 2**23, wide, atol=1e-2)
     wrong = bag_of(tmp_path / "wrong", spoken(stamps, **each, sample_format="S24LE"))
     with pytest.raises(InputFileError, match=r"expected samples of s24, got .* like those of s24_32"):
         read_sound(wrong)
