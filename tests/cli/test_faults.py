@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -17,11 +16,10 @@ import pytest
 import soundfile
 from scripted_states import scripted_states
 
-from worldstate.adapters import OvadDataset, write_array_xml
+from worldstate.adapters import OvadDataset
 from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common import progress
 from worldstate.cli.main import main
-from worldstate.frontend.array.microphone_array import MicrophoneArray
 from worldstate.ground import extras
 from worldstate.simulation.dataset.dataset import LogRow, write_log
 from worldstate.state import Classification, SensorHealth
@@ -186,37 +184,6 @@ def test_bytes_that_are_no_sound_give_one_line(command, suffix, tmp_path, capsys
     assert str(sound) in refusal([*command.split(), str(sound), *out], tmp_path, capsys)
 
 
-def one_line(done: subprocess.CompletedProcess[str]) -> str:
-    assert done.returncode == 2, done
-    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
-    return done.stderr
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        ("sim make --out . --static 1 --duration 0.5", "expected to write"),
-        ("array check a.wav --array mics.xml --figure mics.png", "File too large"),
-    ],
-)
-def test_a_full_disk_leaves_no_file(line, said, tmp_path):
-    """A command may write 4096 bytes per file."""
-    soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0.0, 0.05, (48_000, 4)), 48_000)
-    write_array_xml(tmp_path / "mics.xml", MicrophoneArray([[0, 0.1 * i, 0] for i in range(4)]))
-    limit, before = (4096, 4096), [one for one in tmp_path.rglob("*") if one.is_file()]
-    done = subprocess.run(
-        [*COMMAND, *line.split()],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
-    )
-    assert said in one_line(done)
-    assert [one for one in tmp_path.rglob("*") if one.is_file()] == before
-
-
 def test_a_full_standard_output_gives_one_line():
     for unbuffered in ("", "1"):  # The interpreter itself writes the buffer last.
         with Path("/dev/full").open("w") as full:
@@ -228,7 +195,8 @@ def test_a_full_standard_output_gives_one_line():
                 check=False,
                 env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
             )
-        assert "No space left" in one_line(done)
+        assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+        assert "No space left" in done.stderr
 
 
 def test_a_closed_pipe_is_no_error():

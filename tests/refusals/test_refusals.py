@@ -78,12 +78,9 @@ HOP = measurement.Measurement(
 )
 LIKELIHOODS = {
     "a likelihood of None": (None, 0.0),
-    "a likelihood of text": ("a", 0.0),
     "a likelihood that is no number": (NAN, 0.0),
     "a likelihood for one of two sides": (0.0,),
-    "likelihoods without sides": 1.0,
     "a likelihood of 1e30 nats": (1e30, 0.0),
-    "a likelihood of -1001 nats": (0, -1001),
 }
 SQUARE = MicrophoneArray([[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]])
 PAIR, POLE = MicrophoneArray([[0, 0.1, 0], [0, -0.1, 0]]), [[0, 0, 0], [0, 0, 1.0]]
@@ -221,12 +218,10 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "window of 59 features": (window(np.zeros((3, 59))), "X"),
     "window without a row": (window(np.zeros(60)), "X"),
     "window that is no number": (window(np.full((1, 60), NAN)), "X"),
-    "window with two references": (window(np.zeros((1, 180))), "X"),
     "training without references": (fitted(61, (*CLASSES, *CLASSES)), "reference"),
     "training without a class": (fitted(240, ("left", "front", "right", "left") * 2), "classes"),
     "window classes without front and none": (partial(checked_classes, ("left", "right")), "classes"),
     "window classes in another order": (partial(checked_classes, (*CLASSES, "direct", "both")), "classes"),
-    "unknown window class": (partial(checked_classes, (*CLASSES, "tram")), "classes"),
     # Cameras, ports and sound
     "camera with a view of 180 degrees": (camera(half_angle_rad=1.6), "half_angle_rad"),
     "camera without columns": (camera(width_px=0), "width_px"),
@@ -246,7 +241,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
         partial(camera_health.DegradationLog, np.array([0, 0]), np.array([0.0, 0.0])), "stamps"),
     "quality of an image without colours": (
         partial(camera_health.image_quality, np.zeros((4, 4), np.uint8)), ""),
-    "degraded image of floats": (degraded(GREY / 2, "blur", 0.5), ""),
     "degradation by fog": (degraded(GREY, "fog", 0.5), ""),
     "degradation above one": (degraded(GREY, "blur", 1.5), ""),
     **{f"look at {stamp!r}": (partial(LISTENER.look, stamp, EMPTY), "stamp_ns")
@@ -307,7 +301,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
         "less than half the sample rate of 8000"),
     "one microphone": (partial(MicrophoneArray, [[0, 0, 0]]), "2 to 1024"),
     "positions in a plane": (partial(MicrophoneArray, [[0, 0], [1, 1]]), r"shape \(any, 3\)"),
-    "positions as text": (partial(MicrophoneArray, [["0", "0", "0"], ["0", "1", "0"]]), "numbers"),
     "positions of different length": (partial(MicrophoneArray, [[0, 0, 0], [0, 1]]), "numbers"),
     "two pairs of microphones at one place": (
         partial(MicrophoneArray, [[0, 1, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0]]),
@@ -324,7 +317,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "engine line in too narrow a band": (line(10.0, 20.0), "tone_band_hz: expected a filter"),
     "engine line in a band that falls": (line(400.0, 20.0), "tone_band_hz"),
     "block of three channels for four": (block(np.zeros((10, 3))), "block"),
-    "block of one dimension": (block(np.zeros(10)), "block"),
     "block of text": (block("sound"), "block"),
     "block of None": (block([[None] * 4]), "block"),
     "samples beyond single precision": (block(np.full((2, 4), 1e300)), "block"),
@@ -402,7 +394,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "unknown sound": (partial(sound_kind, "vuvuzela"), "vuvuzela"),
     "outline of one corner": (partial(OccludingBody, ((0.0, 1.0),)), "corners_m"),
     "outline that is no number": (partial(OccludingBody, ((0.0, NAN),) * 2), "corners_m"),
-    "sound of an unknown kind": (sound(kind="vuvuzela"), "vuvuzela"),
     "gusts without channels": (sound(kind="gusts"), "channels"),
     "voice of no duration": (sound(kind="voice", duration_s=0.0), "duration_s"),
     "voice too far away": (sound(kind="voice", place_m=(1e4, 0.0)), "place_m"),
@@ -416,8 +407,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
         partial(simulation.simulate_recording, scene(approach="none", duration_s=0.5)(), RNG,
                 MicrophoneArray([[0.0, 0.1, 0.0], [0.0, -0.1, 3.6]])), r"1\.80 m below"),
     "data set without recordings": (data_set(n_static=0), "n_static"),
-    "data set of an unknown scene": (data_set(scene="tunnel"), "scene"),
-    "data set of horses": (data_set(kind="horse"), "kind"),
     "drive at a merge": (data_set(scene="merge", n_dynamic=1), "n_dynamic"),
     "video of a drive": (data_set(n_dynamic=1, video=True), "video"),
     "background limits out of order": (partial(Traffic, "t", {}, background_db=(3.0, 2.0)), "background_db"),
@@ -425,7 +414,6 @@ REFUSALS: dict[str, tuple[Callable[[], object], str]] = {
     "unknown flow": (partial(Traffic, "t", {"up": 3.0}), "per_hour"),
     "drive of wrong duration": (partial(StreamSettings, simulation.site("DA1"), 1.1), "minutes"),
     "stream at a merge": (partial(StreamSettings, simulation.place("merge").site, 1.0), "junction"),
-    "stream too long": (partial(replace, STREAM, minutes=1000.0), "minutes"),
 }  # fmt: skip
 
 

@@ -15,8 +15,8 @@ from importlib.resources import files
 from worldstate.cli.common.command import Program, run_program
 from worldstate.ground.errors import InvalidArgumentError
 
-# A group is a folder, and a command is a module in it with `add_options`, `run` and a docstring that ends in
-# examples. Slow imports are inside `run`.
+# A group is a folder, and a command is a module in it with `run`, `add_options` if it has options, and a
+# docstring that ends in examples. Slow imports are inside `run`.
 COMMANDS = (
     *("demo", "run", "live", "hear", "explain"),
     *("array check", "array bounds", "array bearings", "array align", "array list"),

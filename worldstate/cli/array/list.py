@@ -15,10 +15,6 @@ from worldstate import adapters
 from worldstate.cli.common import output
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Declare no option but --json."""
-
-
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
     from worldstate.adapters.files.array_file import named_arrays, shipped_models

@@ -35,7 +35,8 @@ class Program:
     """A program and its commands.
 
     The docstring of a command's module is "`PROGRAM [GROUP] NAME`: summary.", the description, and examples
-    as the last paragraph. The module has `add_options`, `run`, and optionally `NEEDS`, its optional modules.
+    as the last paragraph. The module has `run`, and optionally `add_options`, and `NEEDS` with its optional
+    modules.
     """
 
     name: str
@@ -86,7 +87,7 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(program, description=told, epilog=examples, formatter_class=form, allow_abbrev=False)
         self.add_argument("--json", action="store_true", help="print the result as one JSON object")
         self.set_defaults(run=module.run, needs=getattr(module, "NEEDS", ()))
-        module.add_options(self)
+        getattr(module, "add_options", lambda parser: None)(self)
 
     def error(self, message: str) -> NoReturn:
         """Refuse a call."""

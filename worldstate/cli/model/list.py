@@ -19,10 +19,6 @@ from .show import model_card
 _SHOWN = ("array", "microphones", "spacing_mm", "ego_motion", "data")
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Declare no option but --json."""
-
-
 def run(arguments: argparse.Namespace) -> output.CommandResult:
     """Run the command; return its result."""
     from worldstate.adapters.files.array_file import shipped_models
