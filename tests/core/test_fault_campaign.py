@@ -46,7 +46,7 @@ def extreme(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def answer(rng: np.random.Generator) -> CoEvidence:
-    miss, clutter = extreme(rng, 0.0, 1.0), extreme(rng, 1e-12, 0.999)
+    miss, clutter = extreme(rng, 0.0, 1.0), extreme(rng, TINY, 0.999)
     return (Unqueried("-"), Absent(miss, clutter), Present(miss, clutter))[int(rng.integers(0, 3))]
 
 
@@ -104,8 +104,8 @@ def scan(rng: np.random.Generator, stamp_ns: int) -> PositionScan:
     searched = None
     if rng.random() < 0.5:
         sector = Sector(extreme(rng, -np.pi, np.pi), max(extreme(rng, 0.0, np.pi), TINY))
-        found, clutter = min(extreme(rng, 0.0, 1.0), 0.999), np.clip(extreme(rng, 0.0, 1.0), 1e-12, 0.999)
-        searched = SearchedSector(sector, max(extreme(rng, 0.0, 1e4), TINY), found, float(clutter))
+        found, clutter = (min(extreme(rng, low, 1.0), 0.999) for low in (0.0, TINY))
+        searched = SearchedSector(sector, max(extreme(rng, 0.0, 1e4), TINY), found, clutter)
     n = 128 if rng.random() < 0.01 else int(rng.integers(0, 5))
     positions = tuple(position(rng) for _ in range(n))
     latency_s = abs(extreme(rng, 0.0, 3.0)) if rng.random() < 0.1 else 0.0
