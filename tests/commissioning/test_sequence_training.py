@@ -49,7 +49,7 @@ def test_exported_trees_equal_the_geometric_mean_of_classifiers(seed: int, sizes
 
 
 def _stream(rng: np.random.Generator, hops: int = 1200) -> tuple[np.ndarray, StreamTruth]:
-    """Return a synthetic street whose evidence of the left rises before a vehicle, every 12 s."""
+    """Return a synthetic street: every 12 s the evidence of the left side rises before a vehicle."""
     time_s = 0.1 * np.arange(hops)
     coming = np.stack([12.0 - time_s % 12.0, np.full(hops, np.inf)], axis=1)
     rises = np.clip(3.0 - coming[:, 0], -2.0, 3.0)
@@ -102,7 +102,7 @@ def levels_of_readings(calm: tuple[object, object, SequenceModel, FloatArray]) -
 
 @given(st.lists(st.integers(10, 40_000), min_size=1, max_size=8), st.booleans())
 def test_the_number_of_trees_grows_with_the_sound(hops: list[int], moves: bool) -> None:
-    """Seven minutes (--quick) use a tenth of the trees, which otherwise took most of the time."""
+    """Seven minutes (--quick) use a tenth of the trees, because all of them take most of the time."""
     streams = [SimpleNamespace(hops=range(n), ego_moves=moves) for n in hops]
     sizes, few = (MOVING if moves else STANDING), commission.dealt_growth(streams[:1])
     for most, less, every in zip(sizes, few, commission.dealt_growth(streams), strict=True):

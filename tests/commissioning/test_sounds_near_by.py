@@ -85,7 +85,7 @@ def test_new_streets_have_the_stated_false_rate() -> None:
 
 
 def test_streets_with_other_sounds_set_no_threshold() -> None:
-    """Its hops are learned as street, but music called foreign is no false call."""
+    """Their hops are learned as street, but if music there is called foreign, that is right."""
     pair = MicrophoneArray([[0.0, 0.3, 1.7], [0.0, -0.3, 1.7]])
     for name in ("empty", "music"):
         settings = StreamSettings(junction_named("SA101"), 0.2, 1, traffic_named(name), sample_rate_hz=6000.0)
@@ -96,7 +96,7 @@ def test_streets_with_other_sounds_set_no_threshold() -> None:
 
 @pytest.mark.long
 def test_the_shipped_guard_accepts_motorcycles_and_not_machines() -> None:
-    """Clips of new seeds, passing and standing, of other recorders."""
+    """The clips are passes and idling engines of new seeds, from drawn recorders."""
     guard = read_model(None).guard
     assert guard is not None
     for name in ("motorcycle", "idling motorcycle", "light", "jackhammer", "saw"):
@@ -160,7 +160,7 @@ def test_simulated_vehicles_are_audible_before_sight() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["light", "tram"])
 def test_kinds_are_robust_to_the_slope_of_a_recorder(kind: str) -> None:
-    """New clips through a filter of 6 dB from 80 to 2,700 Hz with the shipped model."""
+    """A filter of 6 dB from 80 to 2,700 Hz hardly changes what the shipped model finds in new clips."""
     model, rng, rate_hz = read_model().road_users, np.random.default_rng(3), 6000.0
     assert model is not None
     street = StreamSettings(junction_named("SA1"), 1.0, sample_rate_hz=rate_hz)

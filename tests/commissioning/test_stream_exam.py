@@ -113,7 +113,7 @@ def test_simultaneous_vehicles_form_one_approach() -> None:
 @given(st.lists(st.tuples(st.sampled_from(sorted(CLASS_OF)), st.booleans()), min_size=1, max_size=8))
 @settings(max_examples=20, deadline=None)
 def test_the_card_has_the_recall_of_each_kind(drawn: list[tuple[str, bool]]) -> None:
-    """Oracle: counts of vehicles 20 s apart, each with or without an alarm before T0."""
+    """The oracle is a count of vehicles 20 s apart, each with or without an alarm before T0."""
     told = {"light": "car", "medium": "van", "heavy": "truck"}
     every: list[Vehicle] = [("left", kind, "left", 20.0 * (i + 1)) for i, (kind, _) in enumerate(drawn)]
     alarms = [(one[3] - 2.0, one[3], 0) for one, (_, found) in zip(every, drawn, strict=True) if found]
@@ -154,7 +154,7 @@ def test_an_alarm_counts_within_the_horizon() -> None:
 
 @given(seed=st.integers(0, 2**32), t0_s=st.floats(10.0, 20.0), share=st.floats(0.0, 1.0))
 def test_an_alarm_at_t0_is_that_of_the_last_hop_before(seed: int, t0_s: float, share: float) -> None:
-    """Alarms from T0 on, or over a second before it, change nothing, on either side."""
+    """Alarms after T0, or more than a second before it, have no effect, on either side."""
     rng, time_s = np.random.default_rng(seed), np.round(np.arange(1.0, 30.0, 0.1), 1)
     raised = rng.random((len(time_s), 2)) < share * rng.random()
     found = hop_outcome(StreamApproach("single", (t0_s,), (0,)), time_s, raised)
@@ -295,7 +295,7 @@ def test_the_alarm_is_the_lowest_threshold_within_the_budget(seed: int, budget: 
 @CURVES
 @given(st.integers(0, 2**32 - 1), st.integers(3, 7), st.floats(60.0, 1200.0))
 def test_budgets_for_other_junctions_hold_on_left_out_ones(seed: int, junctions: int, rate: float) -> None:
-    # For any streams, over all ways to leave one out, as for exchangeable junctions.
+    # This holds for any streams, on average over the junctions that are left out.
     quiet, rates = levels(seed, junctions), list[float]()
     there = {name: [levels for junction, levels in quiet if junction == name] for name, _ in quiet}
     for name in there:
@@ -351,7 +351,7 @@ def test_levels_of_a_stream_reproduce_the_advisories_of_the_filter(
 
     told = advised(states(SequenceAlarm(threshold_nats, 20.0))).any(axis=1)
     model = replace(read_model(), street=of_model)
-    with pytest.MonkeyPatch.context() as patch:  # The stream has the measurements of `measured`.
+    with pytest.MonkeyPatch.context() as patch:  # The filter gets the measurements of `measured`.
         patch.setattr(commission, "stream_evidence", lambda windows, stream: None)
         patch.setattr(
             alarm_curve, "measurements", lambda stream, windows, silent, *_, **__: measured(silent.alarm)
@@ -382,7 +382,7 @@ def test_two_quiet_junctions_give_a_threshold_without_alarms_and_one_gives_none(
 def test_the_interval_of_a_curve_has_its_stated_coverage() -> None:
     rng, inside = np.random.default_rng(6), list[bool]()
     for _ in range(100):
-        # Peaks of sixteen junctions with gamma rates, half as wide as their mean.
+        # The rates of sixteen junctions are gamma distributed; their deviation is half of their mean.
         often, hops = rng.gamma(4.0, 0.001, 16), [1500] * 12 + [8000] * 4
         streams = [
             np.where(rng.random(n) < p, rng.exponential(1.0, n), -50.0)
@@ -408,7 +408,7 @@ def test_junctions_and_exams_share_no_random_draws() -> None:
         {one.name: one.seed for plan in plans for one in streams(plan)}
         for streams in (learned_streams, exam_streams)
     )
-    # Approaches and the hazard-free stream of a junction are different traffic with one seed.
+    # Approaches and the hazard-free stream of a junction have different traffic and one seed.
     # The same number of junctions per renderer, each with and without weather.
     assert len(set(learned.values())) == 2 * 2 * 3 * 40 and len(set(exams.values())) == 2 * (5 + 5 + 5)
     assert not set(learned.values()) & set(exams.values())

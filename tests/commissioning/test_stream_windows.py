@@ -49,7 +49,7 @@ def label_at(labels, time_s):
     return labels[np.abs(TIME_S - time_s).argmin()]
 
 
-# A second that ends after sight contains the vehicle, so no empty window follows at once.
+# The second after the vehicle has left still contains it, so no empty window follows at once.
 STANDING = {
     5.0: "none",
     18.5: "",
@@ -73,7 +73,7 @@ def test_windows_have_kind_arm_and_time_of_a_vehicle(site, times):
 def test_two_vehicles_within_1_5_s_are_labelled_both():
     near = hop_labels(stream(("light", "left", 30.0), ("light", "right", 31.2)))
     assert {label_at(near, time) for time in (29.2, 29.9)} == {"both"}
-    # In view, the first covers the second.
+    # The first vehicle, in view, masks the second.
     assert label_at(near, 30.8) == ""
     far = hop_labels(stream(("light", "left", 30.0), ("light", "right", 35.0)))
     assert label_at(far, 29.5) == "left" and label_at(far, 34.9) == "right"
@@ -95,7 +95,7 @@ def test_classes_have_the_weights_of_the_released_windows():
     assert mass == pytest.approx(dict.fromkeys(mass, found.weights[hidden].sum()))
     assert (found.weights[hidden] == WEIGHT).all()
     np.testing.assert_array_equal(found.at(["SA1"]).X, stream_windows(parts[:1]).X)
-    # Separated by site: an open field belongs to none and is always present.
+    # An open field belongs to no site, so its windows are always present.
     everything = SimulatedWindows.joined([found, open_field_windows(np.ones((3, 60)))])
     assert len(everything.at(["SB1"]).y) == (found.sites == "SB1").sum() + 3
     assert len(everything.at([]).y) == 3
@@ -123,7 +123,7 @@ def test_the_card_counts_the_classes_of_learned_streams(tmp_path):
     model = read_model(tmp_path / "m")
     assert model.signature.classes == WINDOW_CLASSES
     assert "180 direct" in model.provenance.classifier and " both" in model.provenance.classifier
-    # Policies of the hypotheses: hidden on either side, in view, none.
+    # The hypotheses of the policies are hidden on either side, in view, and none.
     assert len(model.policies.policies[0].reference_prior) == 4
     assert sum(model.policies.policies[0].reference_prior) == pytest.approx(1.0)
 
@@ -167,7 +167,7 @@ def test_one_rendering_serves_all_arrays() -> None:
 
 
 def test_renderings_are_reused_for_other_arrays(tmp_path, monkeypatch) -> None:
-    """A second array needs no new rendering and has the sound it has alone."""
+    """A second array needs no new rendering, and its sound is the same as alone."""
     settings = StreamSettings(site("SB1"), minutes=0.05, sample_rate_hz=6000.0)
     board = MicrophoneArray(ARRAY.positions_m[:3] * [1.0, 0.5, 1.0])
     (expected,) = hear_stream(settings, [board])
@@ -183,7 +183,7 @@ def test_tables_of_another_array_raise_an_error() -> None:
     table = FeatureTable(np.ones((3, 60)), np.array(["left"] * 3), names, names, names, (None,) * 3)
     kept = windows_of_array(table, CommissionSettings(leave_out=("SB1",)), here)
     assert kept.environments.tolist() == ["SA1", "SB2"]
-    # Without it a commissioned model would have no budget and no times.
+    # Without its domain a commissioned model would have no budget and no times.
     assert kept.domain is here
     elsewhere = domain_of(MicrophoneArray(ARRAY.positions_m * [1.0, 1.1, 1.0]), [6000.0], ["SA1"])
     with pytest.raises(OutOfDomainError, match="not the array"):

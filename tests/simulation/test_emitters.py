@@ -185,7 +185,7 @@ def test_any_rate_and_length_is_reproducible_by_seed(name, rate, samples, seed):
 
 @pytest.mark.parametrize("name", ["horn", "saw", "bell"])
 def test_a_low_rate_gives_the_same_sound_band_limited(name):
-    """Sounds are drawn at 24 kHz, of which 6 kHz is a quarter with the same spectrum below 2.8 kHz."""
+    """Sounds are drawn at 24 kHz; at a quarter of this rate the spectrum below 2.8 kHz is the same."""
     low = emitted(SOUNDS[name], 12_000, 6_000.0, np.random.default_rng(5))
     high = emitted(SOUNDS[name], 48_000, 24_000.0, np.random.default_rng(5))
     spectrum = np.fft.rfft(high)[: len(low) // 2 + 1] / 4
@@ -233,7 +233,7 @@ def test_short_recordings_are_repeated_and_pauses_kept(tmp_path):
     folder = folder_of(tmp_path, "dog", band_noise(0.3, 16_000), 16_000)
     heard = emitted(SOUNDS["dog"], 24_000, 8_000.0, np.random.default_rng(2), folder)
     assert np.square(heard).reshape(-1, 800).mean(axis=1).min() > 0.0
-    # One bark in twenty seconds: the rest of the file is not amplified to its level.
+    # With one bark in twenty seconds, the rest of the file is not amplified to the level of the bark.
     barks = 1e-4 * np.random.default_rng(1).standard_normal(20 * 16_000)
     barks[:4_800] += band_noise(0.3, 16_000)
     folder = folder_of(tmp_path, "dog", barks, 16_000)
@@ -245,7 +245,7 @@ def test_short_recordings_are_repeated_and_pauses_kept(tmp_path):
 
 
 def test_a_recorded_sound_propagates_through_the_street(tmp_path):
-    """Its line is 20 dB above the street, delayed by the path to each microphone."""
+    """The recording is band noise, 20 dB above the street in its band and hardly above it elsewhere."""
     folder = folder_of(tmp_path, "tone", band_noise(4.0, 16_000), 16_000)
     street = SimulationSettings(site("SB1"), "none", duration_s=2.0, sample_rate_hz=6_000.0)
     sounding = replace(
@@ -369,7 +369,7 @@ def test_the_bearing_of_a_sound_is_that_of_its_place(kind, azimuth):
 @settings(max_examples=6, deadline=None)
 @given(st.floats(6.0, 56.0), st.floats(0.0, 360.0))
 def test_pressure_falls_with_distance_above_hard_ground(range_m, azimuth):
-    """The road doubles the energy: birds are too high for interference, 3.3 m above the array."""
+    """The road doubles the energy without interference, because birds sing 3.3 m above the array."""
     dry = emitted(sound_kind("birds"), int(PLACED_HZ), PLACED_HZ, np.random.default_rng(1))
     signal = heard(placed("birds", azimuth, range_m), seconds=1.3)[0]
     found = 10 * np.log10(np.square(signal).sum() / np.square(dry).sum())
@@ -381,7 +381,7 @@ def test_pressure_falls_with_distance_above_hard_ground(range_m, azimuth):
 
 @pytest.mark.parametrize("kind", ["voice", "music", "horn"])
 def test_a_directional_sound_is_weaker_behind_by_its_table(kind):
-    """The same draw faces the array and away; only the levels of bands differ."""
+    """The same sound faces the array or the opposite direction; only the levels of bands differ."""
     front, back = (heard(placed(kind, 0.0, 10.0, facing_rad=way)) for way in (np.pi, 0.0))
     octaves = [split_octaves(one[0], PLACED_HZ).std(axis=1) for one in (front, back)]
     loud = octaves[0] > 0.03 * octaves[0].max()
@@ -450,13 +450,13 @@ def test_wind_levels_are_equal_and_incoherent_at_all_microphones(over_db, lasts_
     assert fifths.argmax() == 2
     frequencies, between = coherence(sound[0, within], sound[4, within], PLACED_HZ, nperseg=256)
     assert between[frequencies > 60.0].mean() < 3.0 * 256 / (lasts_s * PLACED_HZ) + 0.02
-    # Within a fifth of the time around the middle the octave of 100 Hz has the requested level.
+    # In the middle fifth of the time the octave of 100 Hz has the requested level.
     middle = sound[:, round((0.5 + 0.4 * lasts_s) * PLACED_HZ) : round((0.5 + 0.6 * lasts_s) * PLACED_HZ)]
     frequencies, density = welch(middle, PLACED_HZ, nperseg=min(800, middle.shape[1]))
     octave = (frequencies >= 100.0 / np.sqrt(2.0)) & (frequencies <= 100.0 * np.sqrt(2.0))
     power = density[:, octave].mean() * 100.0 / np.sqrt(2.0)
     assert 10.0 * np.log10(power / 4e-10) == pytest.approx(77.0 + over_db, abs=3.0)
-    # Three octaves higher the level is lower by 3.7 times 9 dB.
+    # The level falls by 37 dB per decade from about 98 to 780 Hz.
     high = (frequencies >= 600.0) & (frequencies <= 1000.0)
     fallen_db = 10.0 * np.log10(density[:, octave].mean() / density[:, high].mean())
     assert fallen_db == pytest.approx(37.0 * np.log10(780.0 / 98.0), abs=4.0)

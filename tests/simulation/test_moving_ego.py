@@ -60,7 +60,7 @@ THROUGH_US, BENT = ((9.0, 30.0), (0.0, 0.0)), ((5.0, -20.0), (5.2, -20.0), (-40.
 
 
 def test_a_static_source_keeps_its_place_for_a_moving_ego():
-    """Each microphone of a moving ego has the tone of its own changing distance."""
+    """Each microphone of a moving ego receives a tone delayed by its own changing distance."""
     source = np.array([6.0, 2.5, 1.7])
     street = street_of(OPEN, [[0.3, 0.0, 1.7], [-0.3, 0.0, 1.7]], 2.0, FS, EgoMotion(6.0, 10.0))
     receiver, out = street.receiver, street.static.out
@@ -84,7 +84,7 @@ def test_omitted_wall_patches_have_little_energy(monkeypatch):
     assert 0.0 < np.mean((some - every) ** 2) < 0.02 * np.mean(every**2)
 
 
-# An ego that moves, vehicles that a van, a pier or a wall in the open hides, and streets of both types.
+# A moving ego, vehicles hidden by a van, a pier or a wall in the open, and streets of both types.
 SCENES = {"DA1": ("right", 4), **dict.fromkeys(("SL1", "SP1", "SM1", "SA1", "SA2", "SB1"), ("left", 6))}
 
 
@@ -129,7 +129,7 @@ def test_truth_has_the_sight_of_every_vehicle():
 
 def test_own_noise_follows_the_speed():
     """Tyres from 500 Hz to 2 kHz exceed an empty street while driving and end at the stop."""
-    # A distant vehicle would be a noise that does not follow, and a loud town masks the own noise.
+    # A distant vehicle would add noise that does not follow the speed, and a loud town masks the own noise.
     calm = replace(preset(), far_rate=0.0, ambient_octaves_db=(45.0,) * 8)
     scene = SimulationSettings(site("DB1"), "none", duration_s=4.0, sample_rate_hz=8e3, preset=calm)
     driving, standing = (
@@ -163,7 +163,7 @@ def plans(draw) -> Site:
 @settings(max_examples=16, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.data())
 def test_no_scene_gives_silence_nan_or_a_click(data):
-    """Any site, kind, way and ego: finite, never still, and no sample leaps out of its neighbourhood."""
+    """For any site, kind, way and ego the sound is finite, never silent and without a click."""
     where = data.draw(st.one_of(st.sampled_from([*MOVING_SITES, "SA2", "SB3", *OPEN_NAMES]), plans()))
     duration, approach = data.draw(st.floats(0.5, 1.2)), "left"
     if isinstance(where, Site):
@@ -206,7 +206,7 @@ def test_no_scene_gives_silence_nan_or_a_click(data):
 
 
 def leaps(audio: np.ndarray) -> float:
-    """Largest second difference against the median of the 10 to 20 ms about it."""
+    """Return the largest second difference over the median of the 10 to 20 ms around it."""
     bend = np.abs(np.diff(audio, 2, axis=0))
     blocks = np.array_split(bend, max(len(bend) // 160, 1))
     return float(max((block / np.median(block, axis=0)).max() for block in blocks))
@@ -227,8 +227,8 @@ def test_every_drive_has_one_approach_in_view_before_the_stop(seed: int) -> None
     hazards = [one for one in draw_stream(drawn, PAIR).vehicles if one.hazard]
     assert len(hazards) == {"left": 1, "right": 1, "both": 2, "queue": 2}[hazards[0].event.flow]
     first_s = min(one.t0_s for one in hazards if one.t0_s is not None)
-    # The exam evaluates from five seconds before T0 on, and the first second has no hop; in a pair the second
-    # vehicle may be the earlier one.
+    # The exam begins five seconds before T0, and the first second has no hop. In a pair the second vehicle
+    # may be the earlier one.
     assert (4.0 if len(hazards) == 2 else 6.0) < first_s < drawn.ego.stop_s + 2.0
     for one in hazards:
         assert one.t0_s is not None
@@ -273,7 +273,7 @@ def test_sources_removed_from_a_drive_are_inaudible() -> None:
 
 @pytest.mark.parametrize("name", ["DB101", "DTA101", "DMA101"])
 def test_strong_own_wind_is_reported_as_wind(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every hop of a drive is usable as simulated, none with 20 dB more of its own wind."""
+    """Every hop of a simulated drive is usable; with 20 dB more of its own wind, none is."""
     array, usable = ovad_array(), []
     for more_db in (0.0, 20.0):
         monkeypatch.setattr(ego_sound, "WIND_AT_10_DB", 74.0 + more_db)
@@ -285,7 +285,7 @@ def test_strong_own_wind_is_reported_as_wind(name: str, monkeypatch: pytest.Monk
     assert len(usable[0]) > 30 and all(usable[0]) and not any(usable[1])
 
 
-# A place takes a second with the second renderer and some hundredths with the third.
+# One place takes a second with the second renderer and some hundredths of a second with the third.
 CARRIED = st.sampled_from(["DMA101", "DMB203", "DTA101"])
 PAIR_M = np.array([[0.1, 0.2, 1.6], [-0.1, -0.2, 1.6]])
 
@@ -310,7 +310,7 @@ def carried_past(
 @settings(max_examples=8, deadline=None)
 @given(CARRIED, st.floats(1.0, 4.0), st.floats(0.02, 0.25))
 def test_direct_sound_arrives_at_the_position_of_the_moving_ego(name, speed_mps, sent_s):
-    """A click in view arrives when its path and that of the ego meet, to one sample."""
+    """The arrival of a click in view follows from the motion of the ego, to two samples."""
     rate_hz, ego, click = 24_000.0, EgoMotion(speed_mps, 2.0), np.zeros(80 * KNOT_SAMPLES)
     click[round(sent_s * rate_hz)] = 1.0
     ahead_m, time = drawn_site(name).corner_ahead_m, np.arange(len(click)) / rate_hz
@@ -325,9 +325,9 @@ def test_direct_sound_arrives_at_the_position_of_the_moving_ego(name, speed_mps,
 @settings(max_examples=6, deadline=None)
 @given(CARRIED, st.floats(-25.0, 25.0), st.floats(3.0, 8.0))
 def test_a_tone_stays_a_tone_while_the_ego_passes_places(name: str, y: float, speed_mps: float) -> None:
-    """Places blend without a click; cutting off one block at each puts clicks 36 to 49 dB below the tone.
+    """Gains of places blend without a click; without the blend, clicks are 36 to 49 dB below the tone.
 
-    Residues are at -70 dB and below, but for one moment at DTA101 (y = 13 m, 3 m/s), which has -54 dB.
+    Residues are at most -70 dB, except at one moment at DTA101 (y = 13 m, 3 m/s), where they have -54 dB.
     """
     time = np.arange(94 * KNOT_SAMPLES) / 6000.0
     ends = np.sin(0.5 * np.pi * np.minimum(np.minimum(time / 0.5, (time[-1] - time) / 0.3), 1.0))

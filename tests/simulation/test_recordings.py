@@ -105,7 +105,7 @@ def test_detections_begin_at_line_of_sight_and_truth_agrees(name, approach, seed
 
 @pytest.mark.long
 def test_a_data_set_has_its_layout_for_any_number_of_jobs(tmp_path):
-    """Two of a standing ego, one of a moving one; OVAD has no camera results of the latter."""
+    """The ego stands in two recordings and moves in one, for which OVAD has no camera results."""
     wanted = DatasetSettings(n_static=2, n_dynamic=1, seed=5, duration_s=0.5, kind="bicycle")
     rows = write_dataset(tmp_path / "one", wanted, array=PAIR)
     seen = []
@@ -177,7 +177,7 @@ def test_the_rate_of_distant_vehicles_does_not_depend_on_the_duration(duration_s
 
 
 def test_engine_lines_above_half_the_rate_do_not_alias() -> None:
-    # Lines from 1.4 to 2.8 kHz only: at 3 kHz those above 1.5 kHz would alias below 1.2 kHz.
+    # All lines are from 1.4 to 2.8 kHz: at a rate of 3 kHz those above 1.5 kHz would alias below 1.2 kHz.
     two_kilohertz = tuple(90.0 if octave == 5 else 0.0 for octave in range(8))
     kind = replace(LIGHT, harmonic_share=1.0, propulsion_a_db=two_kilohertz, propulsion_b_db=(0.0,) * 8)
     time = np.arange(0.0, 2.0, 0.05)
@@ -265,7 +265,7 @@ def told(scene: SimulationSettings) -> dict:
 
 
 def check_sight(plan, frames: list[dict]) -> int:
-    """Compare frames over 10 cm from the edge of a shadow; return how many were in view."""
+    """Compare the frames that are over 10 cm from the edge of a shadow; return how many are in view."""
     in_view = 0
     for frame in frames[::4]:
         x, y = frame["position_m"]

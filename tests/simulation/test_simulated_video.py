@@ -1,4 +1,4 @@
-"""Rendered streets: occlusion, times and motion detection."""
+"""Rendered streets: projection, occlusion and times."""
 
 import sys
 from dataclasses import replace
@@ -48,7 +48,7 @@ def filmed(plan, seed=3, camera=SMALL):
 
 
 def changed(frame, other, by=25):
-    """Return the pixels in which two frames differ by much more than sensor noise."""
+    """Return the pixels whose difference between two frames is much larger than the sensor noise."""
     return np.abs(frame.astype(int) - other.astype(int)).max(axis=2) > by
 
 
@@ -75,7 +75,7 @@ def test_rays_equal_those_of_opencv():
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_intersections_equal_those_by_sampling(seed):
-    """Oracle: small steps along the ray until all half-spaces contain the point."""
+    """As an oracle, small steps along each ray find the first point within all half-spaces."""
     rng = np.random.default_rng(seed)
     normals = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(3, 3))])
     offsets = rng.uniform(0.4, 1.0, 9)
@@ -96,7 +96,7 @@ def test_intersections_equal_those_by_sampling(seed):
 
 
 def test_a_car_fills_the_projection_of_its_cuboid():
-    """The bounding box of its colour in the open against the projected corners by OpenCV."""
+    """The bounding box of its colour agrees with the corners that OpenCV projects."""
     street = paint_street(site("SB1"), View(MIDDLE))
     still = street.pixels()
     image = still.copy()
@@ -150,7 +150,7 @@ def test_the_position_of_the_parked_car_follows_from_its_boxes(seed, name):
     right, left = plan.sight_m(parked_lane_m(plan), PinholeCamera.ovad().position_m[:2])
     middle = np.random.default_rng(seed).uniform(0.6 * right, 0.6 * left)
     found = parked_middle_m(park(plan, 20, rng), plan)
-    # A car that the line of sight cuts off has one true end in its box, which is in the image.
+    # If the line of sight cuts off a car, its box has one true end, which is in the image.
     assert found == pytest.approx(middle, abs=0.25)
 
 

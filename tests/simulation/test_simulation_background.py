@@ -47,7 +47,7 @@ def heard(one: WaveField, seed: int = 1) -> np.ndarray:
 
 
 def test_a_diffuse_field_has_the_coherence_of_a_bessel_function():
-    """A diffuse field in two dimensions has J0(kd); equal independent noise halves it."""
+    """The coherence of a diffuse field in two dimensions is J0(kd); equal independent noise halves it."""
     distance_m = 0.25
     for noise, share in ((0.0, 1.0), (1.0, 0.5)):
         pair = heard(field(12.0, np.array([[0.0, 0.0, 0.0], [0.0, distance_m, 0.0]]), noise))
@@ -70,7 +70,7 @@ def test_the_level_is_constant_within_and_between_blocks():
 
 
 def test_flicker_has_its_deviation_and_keeps_the_mean_level():
-    """Levels of band-passed sound: deviation, share common to octaves and correlation time."""
+    """Levels of band-passed sound have the deviation, the common share and the correlation time."""
     seconds, deviation_db, step = 240.0, 3.0, 0.04
     one = replace(field(seconds, np.zeros((1, 3))), flicker_db=deviation_db)
     still, flickering = (

@@ -76,7 +76,7 @@ def test_fractional_delay_error_is_below_minus_50_db(frequency):
 
 
 def test_free_field_waveform_equals_acoular():
-    """Distance, delay and Doppler shift of a vehicle at three microphones."""
+    """Distance, delay and Doppler shift of a vehicle are the same at three microphones."""
     from acoular_scene import Samples, render
 
     n = int(1.2 * FS)
@@ -127,7 +127,7 @@ def test_static_sources_arrive_with_their_delays():
 
 @given(letter=st.sampled_from(["SA", "SB", "TA", "TB", "MA", "MB"]), number=st.integers(101, 999_999))
 def test_vehicles_of_drawn_arms_appear_at_the_corner(letter: str, number: int) -> None:
-    """Entry at the edge of the image would give line of sight seconds before T0."""
+    """If vehicles entered at the edge of the image, the array would have line of sight before T0."""
     place = drawn_site(f"{letter}{number}")
     for approach, lane, corner in zip(
         ("left", "right"), place.lanes_m, (place.corner_left_m, place.corner_right_m), strict=True
@@ -154,7 +154,7 @@ def rigid_wedge_db(r, angle, r0, angle0):
 
 @pytest.mark.parametrize("y", [4.6, 6.0, 20.0])
 def test_a_rendered_corner_equals_a_rigid_wedge(y):
-    """One rigid wall up to the corner and a static source up to 60 degrees behind it."""
+    """There is one rigid wall up to the corner, and a static source up to 60 degrees behind it."""
     site = Site(
         "Wedge", 2.8, 30.0, 4.45, None, 2.8, 30.0, 6.0, 0.98, side_order=1, right_openings_m=((-99.0, 99.0),)
     )
@@ -287,7 +287,7 @@ def test_a_wall_blocks_the_direct_path_up_to_its_end(x, share):
 
 
 def test_a_driving_ego_passes_a_source_in_its_street():
-    """A tone on the changing length of each image, with its Doppler shift."""
+    """The sound is the sum of a tone over the changing length of every image, with its Doppler shift."""
     ego, f, y = EgoMotion(8.0, 10.0), 500.0, -1.6
     x = float(ego.x_m(np.array([0.5]))[0])
     street = street_of(STREET, ONE, 1.0, COARSE_FS, ego)
@@ -321,9 +321,8 @@ def test_sound_and_feature_of_a_street_do_not_depend_on_the_sample_rate(name, be
 @settings(max_examples=4, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(st.floats(1.2, 1.8), st.floats(3.0, 4.5), st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
 def test_the_level_is_continuous_on_a_route_into_an_arm(beside, beyond, side, arm):
-    """At 1.5 m/s steps are small until the steep edge of the corner's shadow."""
-    # Draws have 0.8 to 1.1 dB at most and rarely 1.54, which half as long steps remove, in contrast to a
-    # click.
+    """At 1.5 m/s the steps of the level are small up to the steep edge of the corner's shadow."""
+    # Most draws have steps of 0.8 to 1.1 dB, rarely 1.54 dB. Shorter intervals reduce these, but not a click.
     across, lane = side * beside, STREET.corner_ahead_m + beyond
     turn = (lane - 0.4, across + arm * 0.2), (lane, arm * 3.2)
     way = along(((-4.0, across), (3.0, across), *turn, (lane, arm * 9.0)))

@@ -54,7 +54,7 @@ def test_air_absorption_equals_the_table_of_the_standard(celsius, humidity, db_p
 @pytest.mark.parametrize("source_m", [0.05, 0.3, 0.75])
 @pytest.mark.parametrize("flat_m", [6.0, 12.0, 40.0])
 def test_road_reflection_equals_the_average_of_two_waves(source_m, flat_m):
-    """|1 + rho exp(ik Delta)|^2 over each octave, with both lengths exact, against the energetic sum."""
+    """The oracle is the mean of |1 + rho exp(ik Delta)|^2 over an octave, over the sum of both energies."""
     receiver_m = 1.7
     direct, mirrored = np.hypot(flat_m, receiver_m - source_m), np.hypot(flat_m, receiver_m + source_m)
     f = OCTAVES_HZ[:, None] * np.linspace(2.0**-0.5, 2.0**0.5, 4001)
@@ -94,7 +94,7 @@ def octave_levels_db(signal: np.ndarray) -> np.ndarray:
 @pytest.mark.long
 @pytest.mark.parametrize("name", sorted(KINDS))
 def test_a_vehicle_emits_the_power_of_its_kind(name):
-    """Levels at 1 m over hard ground, all sources together: sound power less 8 dB."""
+    """The level of all sources at 1 m over hard ground is the sound power less 8 dB."""
     path = drive(TIME_S, **PASSING, speed_mps=10.0, kind=vehicle_kind(name))
     parts = emit(path, 4 * round(FS), FS, 0.0, np.random.default_rng(1))
     power = sum(10.0 ** (octave_levels_db(part.signal.astype(float)) / 10.0) for part in parts)
@@ -147,7 +147,7 @@ def _outline(x: float, y: float, width: float, depth: float, turn: float) -> np.
 @given(points, points, st.floats(0.2, 4.0), st.floats(0.2, 4.0), st.floats(0.0, 3.0), points, points)
 @example(-2.0, 0.0, 1.0, 1.0, 0.0, -5.6e-73, 0.0)
 def test_a_body_hides_sources_behind_it(x, y, width, depth, turn, source_x, source_y):
-    """Brute force: a point of the line is in the body, and no path is shorter than a taut string."""
+    """A body hides a source if a point of the line is inside; no detour is longer than a taut string."""
     corners = _outline(x, y, width, depth, turn)
     body = OccludingBody(tuple(map(tuple, corners)))
     line = np.linspace(0.0, 1.0, 4001)[1:-1, None] * [source_x, source_y]

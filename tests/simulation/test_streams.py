@@ -115,7 +115,7 @@ def test_approaches_have_the_requested_numbers_in_turn(seed: int) -> None:
     assert counts == {"left": 10, "right": 10, "both": 20, "queue": 6, "follows": 6}
     entries = [visible_s(event, site("SB1")) for event in events if event.flow in HAZARDS]
     first = np.sort([entry for entry in entries if entry is not None])
-    # Pairs are within some standard deviations of 0.7 s, others half a turn of 24 s apart.
+    # Vehicles of a pair are within some standard deviations of 0.7 s, all others at least 12 s apart.
     assert not ((np.diff(first) > 3.0) & (np.diff(first) < 8.0)).any()
 
 
@@ -230,7 +230,7 @@ def test_a_stop_lasts_2_to_10_s_before_line_of_sight(where: str) -> None:
         still = clock[motion.trajectory(clock).speed_mps < 1e-3]
         stopped_s.append(np.ptp(still))
         assert truth.hazard and truth.t0_s is not None
-        # From rest a vehicle needs over a second for the remaining metre or more.
+        # From rest a vehicle needs more than a second for the last metre or more.
         assert 1.0 < truth.t0_s - (truth.event.start_s + still[-1]) < 5.0
     assert len(stopped_s) == 150
     assert 2.0 - 0.02 < min(stopped_s) < 2.5
@@ -392,7 +392,7 @@ def test_events_rise_to_line_of_sight_from_silence_to_silence() -> None:
     assert levels.argmax() == pytest.approx(np.searchsorted(rows, t0_s) + 4, abs=8)
     edge = np.abs(alone.pressure_pa[:, [0, -1]]).max()
     assert edge < 1e-4 * np.abs(alone.pressure_pa).max()
-    # Independent oracle: the level of the samples of one microphone about one row.
+    # An independent oracle is the level of one microphone around one row.
     at = round((rows[50] - 2.0) * 3000)
     around = alone.pressure_pa[:, at - 150 : at + 150].astype(float)
     assert levels[50] == pytest.approx(10 * np.log10((around**2).mean() / 4e-10), abs=0.02)
@@ -432,7 +432,7 @@ def test_pieces_of_background_join_without_a_seam() -> None:
 @given(seed=st.integers(0, 10_000), microphones=st.lists(st.integers(1, 5), min_size=2, max_size=2))
 @settings(max_examples=2, deadline=None)
 def test_an_array_is_independent_of_other_arrays(place: str, seed: int, microphones: list[int]) -> None:
-    """Wind, drops and gusts of each array are those it has alone."""
+    """Wind, drops and gusts of each array do not depend on the other arrays."""
     traffic = Traffic("all", {"left": 1200, "joins": 600}, sounds={"gusts": 1200, "rain": 600, "voice": 600})
     moment = StreamSettings(drawn_site(place), 0.08, seed, traffic, sample_rate_hz=2000.0)
     draw = np.random.default_rng(seed)
