@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.datasets.ovad import FRAME_RATE_HZ
 from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.simulation.scene.driving import CAMERA, camera_sees
@@ -52,14 +51,14 @@ def detect(trajectory: Trajectory, site: Site, rng: np.random.Generator) -> list
     for x, low, high, sight in zip(ahead, *visible, seen, strict=True):
         share = (high - low) / min(kind.length_m, LENGTH_M)
         clear = share > LEAST_VISIBLE and (sight or not site.is_open)
-        box = project(CAMERA, site, x, (low, high), kind) if clear else None
+        box = project(site, x, (low, high), kind) if clear else None
         missed = rng.random() < miss_rate(x, 0.5 * (low + high))
         jitter, luck = rng.normal(0.0, BOX_NOISE_PX, 4), rng.normal(0.95, 0.03)
         if box is None or missed:
             frames.append(())
         else:
             score = float(np.clip(luck * (0.75 + 0.25 * min(share, 1.0)), 0.3, 0.999))
-            frames.append((SimulatedDetection(inside(box + jitter, CAMERA), round(score, 4), kind.label),))
+            frames.append((SimulatedDetection(inside(box + jitter), round(score, 4), kind.label),))
     return frames
 
 
@@ -69,19 +68,19 @@ def park(site: Site, frames: int, rng: np.random.Generator) -> list[Frame]:
     right, left = site.sight_m(x, CAMERA.position_m[:2])
     middle = rng.uniform(0.6 * right, 0.6 * left)
     low, high = max(middle - LENGTH_M / 2.0, right), min(middle + LENGTH_M / 2.0, left)
-    box = project(CAMERA, site, x, (low, high))
+    box = project(site, x, (low, high))
     if box is None:
         return [()] * frames
     noise = rng.normal(0.0, PARKED_NOISE_PX, (frames, 4))
     scores = np.clip(rng.normal(0.92, 0.02, frames), 0.3, 0.999).round(4)
-    boxes = (inside(box + one, CAMERA) for one in noise)
+    boxes = (inside(box + one) for one in noise)
     return [(SimulatedDetection(*seen),) for seen in zip(boxes, scores.tolist(), strict=True)]
 
 
 def through_rain(
     frames: Sequence[Frame], showers: Iterable[tuple[float, float, float]], rng: np.random.Generator
 ) -> list[Frame]:
-    """Remove boxes that drops on the lens hide; a shower is (start, end, share of lost boxes)."""
+    """Remove boxes at random while the lens is wet; a shower is (start, end, share of lost boxes)."""
     missed, time = np.zeros(len(frames)), np.arange(len(frames)) / FRAME_RATE_HZ
     for begin_s, end_s, share in showers:
         # The lens is dry when the rain ends; drying is not modelled.
@@ -112,9 +111,10 @@ def miss_rate(ahead_m: float, lateral_m: float) -> float:
 
 
 def project(
-    camera: PinholeCamera, site: Site, middle_x: float, ends_y: tuple[float, float], kind: VehicleKind = LIGHT
+    site: Site, middle_x: float, ends_y: tuple[float, float], kind: VehicleKind = LIGHT
 ) -> FloatArray | None:
     """Return the box (left, top, right, bottom) of the visible cuboid; None if it is outside the image."""
+    camera, pitch = CAMERA, CAMERA.pitch_rad
     x = middle_x + kind.width_m * np.array([-0.5, 0.5])
     z = np.array([0.0, kind.height_m]) - ARRAY_HEIGHT_M
     # A corner hides more of the near face than of the far one.
@@ -122,7 +122,6 @@ def project(
     y = np.clip(np.array(ends_y)[:, None], np.minimum(right, left), left)
     places = np.broadcast_arrays(x, y, z[:, None, None])
     corners = np.stack([*map(np.ravel, places)], axis=1) - camera.position_m
-    pitch = camera.pitch_rad
     depth = corners[:, 0] * math.cos(pitch) + corners[:, 2] * math.sin(pitch)
     up = corners[:, 2] * math.cos(pitch) - corners[:, 0] * math.sin(pitch)
     focal = 0.5 * camera.width_px / math.tan(camera.half_angle_rad)
@@ -133,9 +132,9 @@ def project(
     return None if outside else box
 
 
-def inside(box: FloatArray, camera: PinholeCamera) -> tuple[float, float, float, float]:
+def inside(box: FloatArray) -> tuple[float, float, float, float]:
     """Clip to the image, keep at least one pixel, round to tenths."""
-    x = np.clip(box[[0, 2]], 0.0, camera.width_px - 1.0)
-    y = np.clip(box[[1, 3]], 0.0, camera.height_px - 1.0)
+    x = np.clip(box[[0, 2]], 0.0, CAMERA.width_px - 1.0)
+    y = np.clip(box[[1, 3]], 0.0, CAMERA.height_px - 1.0)
     left, top, right, bottom = (round(float(v), 1) for v in (x[0], y[0], x[1], y[1]))
     return left, top, max(right, left + 1.0), max(bottom, top + 1.0)

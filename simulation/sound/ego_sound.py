@@ -194,13 +194,8 @@ def _levels_db(speed: FloatArray, engine_db: float, tyre_db: float) -> list[Floa
     slowest = vehicle.SLOWEST_KMH / 3.6
     # The law does not cover very low speeds; there, rolling noise fades with the speed.
     fade = 20.0 * np.log10(np.clip(speed / slowest, 1e-5, 1.0))
-    tyre = (
-        vehicle.rolling_level_db(speed)
-        + tyre_db
-        + vehicle.POWER_TO_1M_DB
-        - 10.0 * np.log10(len(TYRES_M))
-        + fade
-    )
+    tyre = vehicle.rolling_level_db(speed) + tyre_db + vehicle.POWER_TO_1M_DB
+    tyre = tyre - 10.0 * np.log10(len(TYRES_M)) + fade
     propulsion = vehicle.propulsion_level_db(speed) + vehicle.POWER_TO_1M_DB + engine_db
     bay = propulsion + 10.0 * np.log10(1.0 - EXHAUST_SHARE)
     exhaust = propulsion + 10.0 * np.log10(EXHAUST_SHARE)
@@ -236,7 +231,7 @@ def _emission(firing: FloatArray, line_share: float, rate: float, rng: np.random
 
 
 def _firing_hz(speed: FloatArray, rate: float, rng: np.random.Generator) -> FloatArray:
-    """Return the firing frequency in the highest gear for the mean speed, at least idle, with jitter."""
+    """Draw the firing frequency in the highest gear for the mean speed, at least idle; it fluctuates."""
     mean = float(speed.mean())
     gear = next((g for g in reversed(GEARS_HZ_PER_MPS) if g * mean >= SHIFT_UP_HZ), GEARS_HZ_PER_MPS[0])
     knots = np.arange(0.0, len(speed) / rate + 2.0 * WANDER_STEP_S, WANDER_STEP_S)

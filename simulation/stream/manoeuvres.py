@@ -78,6 +78,8 @@ def confined(route: Route, near_m: float, far_m: float) -> Route:
 
 
 TURN_RADIUS_M, TURN_MPS, ARC_STEPS = 3.5, 4.0, 16
+TURN_M = 0.5 * np.pi * TURN_RADIUS_M
+TURNING = SpeedLimit(0.0, TURN_MPS), SpeedLimit(TURN_M, TURN_MPS)  # Limits of a turn that begins at 0
 OWN_LANE_M = 1.8  # Beside the ego, whose half width is 0.9 m, as far as a side wall allows
 KERB_M = 0.95  # Half a vehicle and a hand's breadth
 BESIDE_M, SHORTEST_M = 30.0, 10.0  # Distance over which a vehicle is followed into another street
@@ -194,28 +196,22 @@ def turns_away(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     turn_y = driver.entry_y_m() + driver.side * before
     corner = _arc((lane, turn_y), (0.0, -driver.side), (-1.0, 0.0))
     points = np.concatenate([[[lane, turn_y + driver.side]], corner, corner[-1:] - [[BESIDE_M, 0.0]]])
-    limits = [SpeedLimit(0.0, TURN_MPS), SpeedLimit(0.5 * np.pi * TURN_RADIUS_M, TURN_MPS)]
-    return _beside(driver, along(points, 1.0), (-driver.reach_from(before), BESIDE_M), limits)
+    return _beside(driver, along(points, 1.0), (-driver.reach_from(before), BESIDE_M), TURNING)
 
 
 def stands(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     """Stop behind the corner with the engine running, then turn into a side street."""
     away = turns_away(driver, rng)
     stop = SpeedLimit(-rng.uniform(1.0, 8.0), 0.0, rng.uniform(8.0, 40.0))
-    limits = [stop, SpeedLimit(0.0, TURN_MPS), SpeedLimit(0.5 * np.pi * TURN_RADIUS_M, TURN_MPS)]
     span = float(away.motion.driven_m[0]), float(away.motion.driven_m[-1])
-    motion = driver.motion(away.motion.route, span, limits)
+    motion = driver.motion(away.motion.route, span, [stop, *TURNING])
     return replace(away, motion=motion, arrives_s=motion.reaches_s(stop.at_m))
 
 
 def drives_off(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     """Pull out from the kerb behind the corner and drive away from the junction."""
     y = _hidden_y_m(driver, rng.uniform(6.0, 30.0))
-    lane = driver.lane_m(into=True)
-    limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 6.0))]
-    route = along([[lane, y], [lane, y + driver.side]])
-    motion = driver.motion(route, (0.0, max(driver.reach_m - abs(y), SHORTEST_M)), limits, into=True)
-    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
+    return _pulls_out(driver, y, max(driver.reach_m - abs(y), SHORTEST_M), rng.uniform(1.0, 6.0))
 
 
 def joins(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
@@ -260,13 +256,9 @@ def from_behind(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
 
 def from_ahead(driver: Driver, rng: np.random.Generator) -> Manoeuvre:
     """Approach the ego and turn into the arm; with a wall opposite, pull out from the kerb in view."""
-    lane = driver.lane_m(into=True)
     if driver.site.opposite_wall_m is None:
-        return _turn_into(driver, (lane + TURN_RADIUS_M, 1.2), (-1.0, 0.0))
-    route = along([[lane, -driver.side], [lane, 0.0]])
-    limits = [SpeedLimit(0.0, 0.0, rng.uniform(1.0, 4.0))]
-    motion = driver.motion(route, (0.0, driver.reach_m), limits, into=True)
-    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
+        return _turn_into(driver, (driver.lane_m(into=True) + TURN_RADIUS_M, 1.2), (-1.0, 0.0))
+    return _pulls_out(driver, -driver.side, driver.reach_m, rng.uniform(1.0, 4.0))
 
 
 MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
@@ -289,7 +281,15 @@ MANOEUVRES: dict[str, Callable[[Driver, np.random.Generator], Manoeuvre]] = {
 }
 
 
-def _through(driver: Driver, limits: list[SpeedLimit]) -> Manoeuvre:
+def _pulls_out(driver: Driver, y_m: float, reach_m: float, stands_s: float) -> Manoeuvre:
+    """Stand at the kerb of the lane into the arm, pull out and drive on for a distance."""
+    lane = driver.lane_m(into=True)
+    route, stop = along([[lane, y_m], [lane, y_m + driver.side]]), SpeedLimit(0.0, 0.0, stands_s)
+    motion = driver.motion(route, (0.0, reach_m), [stop], into=True)
+    return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
+
+
+def _through(driver: Driver, limits: Sequence[SpeedLimit]) -> Manoeuvre:
     """Drive along the crossing street; the arrival is the time of line of sight."""
     lane, entry = driver.lane_m(), driver.entry_y_m()
     route = along([[lane, entry], [lane, entry - driver.side]])
@@ -302,13 +302,13 @@ def _turn_into(driver: Driver, turn_m: tuple[float, float], towards: tuple[float
     corner = _arc(turn_m, towards, (0.0, driver.side))
     before = np.array(turn_m) - towards
     points = np.concatenate([[before], corner, corner[-1:] + np.array([0.0, driver.side])])
-    length = 0.5 * np.pi * TURN_RADIUS_M
-    limits = [SpeedLimit(0.0, TURN_MPS), SpeedLimit(length, TURN_MPS)]
-    motion = driver.motion(along(points, 1.0), (-driver.reach_m, length + driver.reach_m), limits, into=True)
+    motion = driver.motion(along(points, 1.0), (-driver.reach_m, TURN_M + driver.reach_m), TURNING, into=True)
     return Manoeuvre(driver.arm, motion, motion.reaches_s(0.0))
 
 
-def _beside(driver: Driver, route: Route, span_m: tuple[float, float], limits: list[SpeedLimit]) -> Manoeuvre:
+def _beside(
+    driver: Driver, route: Route, span_m: tuple[float, float], limits: Sequence[SpeedLimit]
+) -> Manoeuvre:
     """Drive in another street, whose mouth alone emits the sound."""
     near, far = driver.site.lanes_m
     motion = driver.motion(route, span_m, limits)

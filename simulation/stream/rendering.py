@@ -105,7 +105,7 @@ class StreamScene:
 
     @property
     def piece(self) -> int:
-        """Samples in a piece: at least two overlaps, so that only neighbours meet; a drive is one piece."""
+        """Samples in a piece: two overlaps or more, so that only neighbours overlap; a drive is one piece."""
         if not self.settings.ego.stands:
             return self.settings.samples
         rate = self.settings.sample_rate_hz
@@ -255,14 +255,6 @@ AMBIENCE, EVENT, EGO_NOISE = 3, 4, 8  # Purposes of generators
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
-    """The events that begin in one piece of the stream, with their numbers."""
-
-    number: int
-    events: dict[int, Event]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Block:
     """Sound from one sample on, and the loudness of the events that begin in it."""
 
@@ -291,34 +283,32 @@ def render_blocks(scene: StreamScene, events: Sequence[Event], jobs: int = 1) ->
             pending, left = sound[:, length:].copy(), left - length
 
 
-def pieces(scene: StreamScene, events: Sequence[Event]) -> list[Piece]:
-    """Assign the events to the pieces in which they begin; events before the stream go to the first piece."""
+def pieces(scene: StreamScene, events: Sequence[Event]) -> list[tuple[int, dict[int, Event]]]:
+    """Return number and events of every piece: those that begin in it, or before the stream in the first."""
     first = np.maximum([event.start_s for event in events], 0.0) * scene.settings.sample_rate_hz
     owner = (first // scene.piece).astype(int)
-    return [
-        Piece(number, {i: events[i] for i in np.flatnonzero(owner == number).tolist()})
-        for number in range(-(-scene.settings.samples // scene.piece))
-    ]
+    count = -(-scene.settings.samples // scene.piece)
+    return [(i, {k: events[k] for k in np.flatnonzero(owner == i).tolist()}) for i in range(count)]
 
 
-def render_piece(scene: StreamScene, piece: Piece) -> Block:
+def render_piece(scene: StreamScene, piece: tuple[int, dict[int, Event]]) -> Block:
     """Render the background of one piece and, completely, all events that begin in it."""
-    settings, begin = scene.settings, piece.number * scene.piece
-    rate, within = settings.sample_rate_hz, scene.within_s
+    (number, events), settings = piece, scene.settings
+    begin, rate, within = number * scene.piece, settings.sample_rate_hz, scene.within_s
     ends = [
         round(max(one.start_s, within[0]) * rate) + event_blocks(one, rate, within) * KNOT_SAMPLES
-        for one in piece.events.values()
+        for one in events.values()
     ]
     samples = max([end - begin for end in ends] + [scene.piece + overlap_samples(settings)])
     sound = np.zeros((len(scene.microphones.positions_m), samples), np.float32)
     loudness = {}
     with threadpool_limits(1):  # The number of BLAS threads would change the last bits
-        _add_background(sound, scene, piece.number)
-        for number, event in piece.events.items():
-            alone, rows_s = _event_alone(scene, number, event), row_times(event, settings)
+        _add_background(sound, scene, number)
+        for k, event in events.items():
+            alone, rows_s = _event_alone(scene, k, event), row_times(event, settings)
             at = [EventSound(alone.first, alone.pressure_pa[own]) for own in scene.microphones.slices]
             both = ([loudness_db(one, rows_s, rate, banded=banded) for banded in (False, True)] for one in at)
-            loudness[number] = np.array(list(both))
+            loudness[k] = np.array(list(both))
             heard = alone.pressure_pa[:, max(-alone.first, 0) :]
             first = max(alone.first, 0) - begin
             sound[:, first : first + heard.shape[1]] += heard
@@ -326,7 +316,7 @@ def render_piece(scene: StreamScene, piece: Piece) -> Block:
 
 
 def _event_alone(scene: StreamScene, number: int, event: Event) -> EventSound:
-    """Render one event at all arrays; weather at each separately, because drops and gusts hit microphones."""
+    """Render one event at all arrays; weather is rendered for each, because it hits single microphones."""
     settings, microphones = scene.settings, scene.microphones
     street, drive = (settings.site, settings.drawn_preset), (settings.ego, scene.within_s)
     if not isinstance(event, SoundEvent) or event.sound.kind not in WEATHER:
