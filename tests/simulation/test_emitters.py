@@ -49,8 +49,7 @@ from worldstate.simulation.sound.delay import KNOT_SAMPLES
 from worldstate.simulation.stream.close_sounds import close_sound, close_vehicle, idling_vehicle, recorded
 from worldstate.simulation.stream.settings import StreamSettings
 
-FS = 32_000.0
-SECONDS = 6
+FS, SECONDS = 32_000.0, 6
 
 
 @pytest.fixture(scope="module")
@@ -295,8 +294,7 @@ def test_the_command_adds_and_reports_kinds_and_a_folder(tmp_path, capsys):
     assert "vuvuzela" in refusal(capsys, tmp_path / "c", f"{words} vuvuzela")
 
 
-RATE_HZ, PASS_S = 6000.0, 5.0
-STREET = StreamSettings(junction_named("SA1"), 1.0)
+RATE_HZ, PASS_S, STREET = 6000.0, 5.0, StreamSettings(junction_named("SA1"), 1.0)
 
 
 @pytest.mark.long

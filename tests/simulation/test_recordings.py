@@ -61,10 +61,8 @@ def test_energy_is_continuous_across_line_of_sight_entry(name, side):
             straight = np.hypot(np.hypot(path.source.x_m, y - path.receiver.offset_m), 1.4)
             length = path.lit * straight + (1.0 - path.lit) * path.bent_m
             energy += (path.gain[:, :6] / length[:, None]) ** 2
-        level_db = 10 * np.log10(energy)
+        level_db, seen, hidden = 10 * np.log10(energy), np.abs(y) < 1.0, np.abs(y) > 10.0
         assert np.abs(np.diff(level_db, axis=0)).max() < 0.1
-        seen = np.abs(y) < 1.0
-        hidden = np.abs(y) > 10.0
         assert level_db[seen].mean() > level_db[hidden].mean() + 5.0  # hard walls opposite each other
 
 

@@ -174,8 +174,7 @@ def test_the_level_is_continuous_at_the_edge_of_the_shadow(plan, side) -> None:
     assert level_db[0] < -9.0 and abs(level_db[-1]) < 1.0
 
 
-ROOM_M, HEIGHT_M, EAR_M = (30.0, 20.0), 6.0, 1.6
-KEPT = 0.7
+ROOM_M, HEIGHT_M, EAR_M, KEPT = (30.0, 20.0), 6.0, 1.6, 0.7
 
 
 def walled_yard(scattered: float = 0.0) -> Houses:

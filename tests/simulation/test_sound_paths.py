@@ -280,10 +280,12 @@ def test_walls_add_the_images_of_a_source_in_view(plan, x, y, images, limit_db):
 
 @pytest.mark.parametrize(("x", "share"), [(-8.0, 0.0), (3.0, 0.0), (45.0, 1.0)])
 def test_a_wall_blocks_the_direct_path_up_to_its_end(x, share):
-    """Compare the whitened energy at the time of the direct path with all energy."""
+    """The sound of a hidden source arrives round the end of the wall and is fainter."""
     (found,) = heard(MERGE, at(x, 5.6), 0.15)
     straight = arrivals([np.hypot(x, 5.6)], [1.0], len(found))
+    bent = arrivals([np.hypot(7.0 - x, 3.0) + np.hypot(7.0, 2.6)], [1.0], len(found))
     assert found @ straight / (straight @ straight) == pytest.approx(share, abs=0.03)
+    assert share or 0.05 < found @ bent / (bent @ bent) < 0.5
 
 
 def test_a_driving_ego_passes_a_source_in_its_street():
