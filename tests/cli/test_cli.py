@@ -28,6 +28,20 @@ from worldstate.ground.errors import InputFileError
 from worldstate.state import snapshot_schema
 
 
+@pytest.fixture
+def refusal(capsys):
+    """Return a function that runs a command, which must fail with one line, and returns the line."""
+
+    def line_of(words):
+        assert main(words) == 2
+        captured = capsys.readouterr()
+        (line,) = captured.err.strip().splitlines()
+        assert captured.out == ""
+        return line
+
+    return line_of
+
+
 def help_of(words: str, capsys) -> str:
     with pytest.raises(SystemExit) as stop:
         main(words.split())
@@ -68,9 +82,8 @@ def test_a_program_or_group_without_a_command_prints_its_help(words, capsys):
 
 
 @pytest.mark.parametrize("option", FORMER_OPTIONS)
-def test_an_option_that_is_gone_names_what_stands_in_its_place(option, capsys):
-    assert main(["run", "some.wav", f"{option}=1"]) == 2
-    line = one_line_of(capsys)
+def test_an_option_that_is_gone_names_what_stands_in_its_place(option, refusal):
+    line = refusal(["run", "some.wav", f"{option}=1"])
     successor = re.findall(r"--[a-z-]+|pcm:", FORMER_OPTIONS[option])
     assert FORMER_OPTIONS[option] in line and successor
     known = PROGRAM.parser("run")._option_string_actions
@@ -86,21 +99,22 @@ def own(tmp_path, monkeypatch):
     return tmp_path
 
 
+OTHER_ARRAY = "not the array of the model", "4 microphones", "--uncalibrated"
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("own.wav", ("expected --array", "4 channels", "uma-8", "array bearings", "model make")),
-        (
-            "own.wav --array mics.csv --model uma-8",
-            ("not the array of the model", "4 microphones", "--uncalibrated"),
-        ),
-        ("nothing.wav --out s.jsonl", ("nothing.wav",)),
-        ("own.wav --array uma-8 --out s.jsonl", ("own.wav", "7", "4")),
+        ("run own.wav", ("expected --array", "4 channels", "uma-8", "array bearings", "model make")),
+        ("run own.wav --array mics.csv --model uma-8", OTHER_ARRAY),
+        ("run nothing.wav --out s.jsonl", ("nothing.wav",)),
+        ("run own.wav --array uma-8 --out s.jsonl", ("own.wav", "7", "4")),
+        ("nothing", ("expected one of",)),
+        ("array nothing", ("expected one of",)),
     ],
 )
-def test_a_wrong_call_is_answered_in_one_line(line, said, own, capsys):
-    assert main(["run", *line.split()]) == 2
-    printed = one_line_of(capsys)
+def test_a_wrong_call_is_answered_in_one_line(line, said, own, refusal):
+    printed = refusal(line.split())
     assert all(words in printed for words in said)
     assert {path.name for path in own.iterdir()} == {"own.wav", "mics.csv"}
 
@@ -117,14 +131,13 @@ def test_a_wrong_call_is_answered_in_one_line(line, said, own, capsys):
         ("run states.mcap", "rosbags", "ros"),
     ],
 )
-def test_the_extra_of_a_missing_package_is_named(line, package, extra, own, capsys, monkeypatch):
+def test_the_extra_of_a_missing_package_is_named(line, package, extra, own, refusal, monkeypatch):
     for name in ("states.jsonl", "states.mcap"):
         write_states(Path(name), scripted_states())
     before = sorted(own.iterdir())
     typestore.cache_clear()
     monkeypatch.setitem(sys.modules, package, None)
-    assert main(line.split()) == 2
-    assert f"worldstate[{extra}]" in one_line_of(capsys)
+    assert f"worldstate[{extra}]" in refusal(line.split())
     assert sorted(own.iterdir()) == before
 
 
@@ -142,9 +155,8 @@ def test_progress_is_a_line_where_there_is_no_terminal(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("former", FORMER)
-def test_a_former_command_is_refused_with_its_successor(former, capsys):
-    assert main([former, "--json"]) == 2
-    assert f"`{FORMER[former]}`" in one_line_of(capsys)
+def test_a_former_command_is_refused_with_its_successor(former, refusal):
+    assert f"`{FORMER[former]}`" in refusal([former, "--json"])
     program, *words = FORMER[former].split()
     programs = {"worldstate": PROGRAM, "worldstate-lab": LABORATORY}
     assert " ".join(words) in programs[program].commands
@@ -157,8 +169,7 @@ def test_a_card_has_its_sources_and_the_gap_of_others_only_without_own_recording
     kinds = (KindShare("bicycle", 0.0, 12), KindShare("car", 0.777, 49))
     made = read_model()
     sources = DataSource("some windows", "coefficients"), DataSource("some clips", "thresholds", "CC0")
-    about = {"real": rows, "kinds": kinds, "exam": {"detected": 0.5}, "sources": sources}
-    provenance = replace(made.provenance, **about)
+    provenance = replace(made.provenance, real=rows, kinds=kinds, exam={"detected": 0.5}, sources=sources)
     save_model(tmp_path / "m.json.gz", replace(made, provenance=provenance))
     assert main(["model", "show", str(tmp_path / "m.json.gz")]) == 0
     card = capsys.readouterr().out
@@ -195,20 +206,6 @@ def test_a_list_names_what_there_is_and_what_ships(word, tmp_path, monkeypatch, 
         assert json.loads(capsys.readouterr().out.splitlines()[0])["ego_motion"] == "standing"
     assert main([word, "list"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == len(told)
-
-
-@pytest.mark.parametrize("words", [["nothing"], ["array", "nothing"]])
-def test_a_word_that_is_no_command_is_one_line(words, capsys):
-    assert main(words) == 2
-    assert "expected one of" in one_line_of(capsys)
-
-
-def one_line_of(capsys) -> str:
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    lines = captured.err.strip().splitlines()
-    assert len(lines) == 1, captured.err
-    return lines[0]
 
 
 @pytest.fixture(scope="module")

@@ -48,8 +48,8 @@ def test_commissioning_of_four_microphones_resumes(command, tmp_path, capsys, re
     assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "model.streams").iterdir()} == heard
     assert out.read_bytes() == before
-    boards = ["--array", "respeaker-4", "--out", str(tmp_path / "boards")]
-    assert main([*command, *boards, "--no-exam", "--streams", str(tmp_path / "model.streams")]) == 0
+    boards = [*command[:2], "--array", "respeaker-4", *command[2:], "--out", str(tmp_path / "boards")]
+    assert main([*boards, "--no-exam", "--streams", str(tmp_path / "model.streams")]) == 0
     made = {path.name: path for path in (tmp_path / "boards").iterdir()}
     assert set(made) == {"respeaker-4.json.gz", "mics.json.gz"}
     # The same model except for the card of the omitted exam.
