@@ -50,7 +50,7 @@ def help_of(words: str, capsys) -> str:
 
 
 @pytest.mark.parametrize("command", PROGRAM.commands)
-def test_every_command_explains_itself_with_an_example(command, capsys):
+def test_the_help_of_every_command_has_an_example(command, capsys):
     text = help_of(f"{command} --help", capsys)
     assert "example" in text
     assert f"worldstate {command}" in text
@@ -58,7 +58,7 @@ def test_every_command_explains_itself_with_an_example(command, capsys):
     assert help_of(f"help {command}", capsys) == text
 
 
-def test_all_commands_stand_on_one_screen_with_their_words(capsys):
+def test_the_overview_of_all_commands_fits_on_one_screen(capsys):
     assert main(["--help"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 50
@@ -82,7 +82,7 @@ def test_a_program_or_group_without_a_command_prints_its_help(words, capsys):
 
 
 @pytest.mark.parametrize("option", FORMER_OPTIONS)
-def test_an_option_that_is_gone_names_what_stands_in_its_place(option, refusal):
+def test_a_removed_option_gives_an_error_with_its_successor(option, refusal):
     line = refusal(["run", "some.wav", f"{option}=1"])
     successor = re.findall(r"--[a-z-]+|pcm:", FORMER_OPTIONS[option])
     assert FORMER_OPTIONS[option] in line and successor
@@ -141,7 +141,7 @@ def test_the_extra_of_a_missing_package_is_named(line, package, extra, own, refu
     assert sorted(own.iterdir()) == before
 
 
-def test_progress_is_a_line_where_there_is_no_terminal(monkeypatch, capsys):
+def test_progress_is_a_line_without_a_terminal(monkeypatch, capsys):
     monkeypatch.setattr(progress, "EVERY_S", 0.01)
     monkeypatch.setitem(sys.modules, "rich", None)
     with progress.progress_bar("working", 4) as bar:
@@ -187,7 +187,7 @@ def test_a_card_has_its_sources_and_the_gap_of_others_only_without_own_recording
 
 
 @pytest.mark.parametrize("word", ["array", "model"])
-def test_a_list_names_what_there_is_and_what_ships(word, tmp_path, monkeypatch, capsys):
+def test_lists_contain_all_boards_and_shipped_models(word, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(array_file, "MODELS", tmp_path)
     save_model(tmp_path / "uma-8.json.gz", read_model())
     assert main([word, "list", "--json"]) == 0
@@ -245,7 +245,7 @@ def test_a_verb_shows_the_arguments_that_the_command_has(verb):
 
 
 @pytest.mark.long
-def test_run_writes_one_snapshot_a_hop(approach, tmp_path, capsys):
+def test_run_writes_one_snapshot_per_hop(approach, tmp_path, capsys):
     states = tmp_path / "states.jsonl"
     outputs = ["--out", str(states), "--figure", str(tmp_path / "t.png"), "--json"]
     assert main(["run", str(approach.folder), *outputs]) == 0
@@ -305,6 +305,6 @@ def test_bash_completes(script, words, found, request):
     assert sorted(answer.stdout.split()) == sorted(found)
 
 
-def test_it_is_printed_alone_so_that_a_shell_can_read_it(script, capsys):
+def test_the_completion_script_is_printed_alone(script, capsys):
     assert main(["completion", "bash"]) == 0
     assert capsys.readouterr().out == script + "\n"

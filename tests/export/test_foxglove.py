@@ -89,7 +89,7 @@ def test_every_message_holds_to_the_schema_of_its_channel(logged):
 
 def test_an_image_is_the_frame_of_its_time(logged):
     images = messages(logged[0], "/camera/image")
-    assert len(images) == 5, "the video ends after 1.4 s, where the sixth hop has no new frame"
+    assert len(images) == 5, "the video ends after 1.4 s, so the sixth hop has no new frame"
     for _, _, message in images:
         jpeg = base64.b64decode(json.loads(message.data)["data"])
         grey = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).mean()
@@ -129,7 +129,7 @@ def of_foxglove(name):
 
 
 def as_protobuf_json(value, key=""):
-    """Write time stamps and durations as protobuf's JSON does; all else is the same."""
+    """Convert time stamps and durations to protobuf's JSON; everything else is equal."""
     if isinstance(value, list):
         return [as_protobuf_json(one) for one in value]
     if not isinstance(value, dict):
@@ -167,7 +167,7 @@ def test_the_sound_of_a_log_is_that_of_the_first_microphone_that_hears(tmp_path)
     assert samples[:2].tolist() == [-16384, 16384]
 
 
-def test_a_scene_shows_who_is_there_where_was_looked_and_the_risk():
+def test_a_scene_shows_entities_searched_sectors_and_risks():
     drawn = [{item.id: item for item in scene_update(state).entities} for state in STATES]
     hidden = STATES[0]
     assert {"ego", "cue left", "cue right", "searched camera", "occluder corner_left"} <= set(drawn[0])
@@ -212,7 +212,7 @@ def test_the_layout_shows_topics_that_are_written(logged):
 
 
 def test_a_log_that_was_cut_anywhere_is_read_up_to_its_last_whole_chunk(logged, tmp_path, caplog):
-    """Within a chunk, a head, the index and the footer: every byte where records are small, else some."""
+    """The log is cut within a chunk, a head, the index and the footer."""
     path, whole = tmp_path / "cut.mcap", logged[0].read_bytes()
     written, before = logged[1].read_text().splitlines(), 0
     for end in [*range(0, len(whole), 1009), *range(len(whole) - 3000, len(whole), 7)]:
@@ -230,7 +230,7 @@ def test_a_log_that_was_cut_anywhere_is_read_up_to_its_last_whole_chunk(logged, 
 
 
 def printed_by_rerun(path):
-    """Return what Rerun's command line prints of a recording, after its check."""
+    """Check a recording with Rerun's command line; return its output."""
     said = ""
     for word in ("verify", "print"):
         command = [sys.executable, "-m", "rerun", "rrd", word, str(path)]
@@ -262,7 +262,7 @@ def test_a_rerun_recording_has_the_scene_the_power_and_the_images(tmp_path):
 
 
 def client_of(port, *origins, **more):
-    # Names of headers have no case.
+    # The case of a header's name does not matter.
     protocol, origins = ["foxglove.sdk.v1"], [*zip(("origin", "Origin"), origins, strict=False)]
     at = f"ws://127.0.0.1:{port}"
     return connect(
@@ -287,7 +287,7 @@ def subscribed(client, *topics):
     return channels
 
 
-def test_a_viewer_receives_the_snapshots_in_the_time_that_they_tell():
+def test_a_viewer_receives_snapshots_with_their_times():
     first, second, third = scripted_states()[:3]
     with live_server(0) as (send, port), client_of(port) as client:
         for message in state_messages(first):
@@ -297,7 +297,7 @@ def test_a_viewer_receives_the_snapshots_in_the_time_that_they_tell():
         assert json.loads(snapshot["schema"])["properties"]["stamp_ns"]["type"] == "integer"
         for state in (second, third):
             data = b""
-            # A subscription is not answered, so that the first messages may come before it counts.
+            # A subscription has no answer, so the first messages may be sent before it is effective.
             while struct.unpack_from("<Q", data + bytes(13), 5)[0] != state.stamp_ns:
                 for message in state_messages(state):
                     send(message)
@@ -321,7 +321,7 @@ def test_a_recording_plays_no_faster_than_its_sound():
         assert time.monotonic() - begun_s >= lasted_s
 
 
-def test_a_port_that_is_taken_is_named():
+def test_a_taken_port_raises_an_error():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(InvalidArgumentError, match=f"free port, got {port}"), live_server(port):
@@ -337,7 +337,7 @@ def test_a_port_that_is_taken_is_named():
         (["https://app.foxglove.dev.evil.example"], False),
     ],
 )
-def test_a_page_of_the_web_sees_nothing_unless_its_origin_is_named(origins, taken):
+def test_web_pages_of_other_origins_are_refused(origins, taken):
     with live_server(0, origins=["https://app.foxglove.dev"]) as (_, port):
         if taken:
             with client_of(port, *origins) as client:
@@ -347,7 +347,7 @@ def test_a_page_of_the_web_sees_nothing_unless_its_origin_is_named(origins, take
                 client_of(port, *origins)
 
 
-def test_what_is_no_websocket_is_refused_and_places_are_few():
+def test_other_requests_and_viewers_beyond_the_limit_are_refused():
     with live_server(0) as (_, port):
         with socket.create_connection(("127.0.0.1", port), 20.0) as page:
             page.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -368,7 +368,7 @@ def test_what_is_no_websocket_is_refused_and_places_are_few():
 
 
 def dripping(port, number):
-    """Open connections that never ask, from as many addresses as there are numbers."""
+    """Open connections with incomplete requests, one from each numbered address."""
     asked = []
     for one in number:
         asked.append(socket.socket())
@@ -379,7 +379,7 @@ def dripping(port, number):
 
 
 @pytest.mark.parametrize("number", [[1] * 40, range(2, 130)])
-def test_connections_that_drip_keep_no_viewer_out(number):
+def test_incomplete_requests_do_not_block_viewers(number):
     with live_server(0) as (_, port):
         asked = dripping(port, number)
         try:
@@ -393,7 +393,7 @@ def test_connections_that_drip_keep_no_viewer_out(number):
                 one.close()
 
 
-def test_one_deadline_holds_for_a_whole_head(monkeypatch):
+def test_a_request_has_one_deadline(monkeypatch):
     monkeypatch.setattr(foxglove_server, "_HEAD_S", 0.6)
     with live_server(0) as (_, port):
         (one,) = dripping(port, [1])
@@ -411,7 +411,7 @@ def test_one_deadline_holds_for_a_whole_head(monkeypatch):
         one.close()
 
 
-def test_a_viewer_that_takes_nothing_holds_nobody_up_and_is_let_go(monkeypatch):
+def test_a_viewer_that_reads_nothing_delays_no_message_and_is_disconnected(monkeypatch):
     monkeypatch.setattr(foxglove_server, "STALLED_S", 0.5)
     gates = []
     monkeypatch.setattr(

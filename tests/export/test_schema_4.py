@@ -1,4 +1,4 @@
-"""Logs of schema 3.x, which version 0.3 wrote, and snapshots without side and risk, through every reader."""
+"""Logs of schema 3.x, which version 0.3 wrote, and snapshots without side and risk, in every reader."""
 
 import gzip
 import json
@@ -22,7 +22,7 @@ from worldstate.state import RiskCue
 
 FORMER = Path(__file__).parent / "schema_3"
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
-# What follows for the cues of each snapshot, in turn, of the logs that 0.3 wrote.
+# Reasons against the use of the cues, for each snapshot of the logs that version 0.3 wrote.
 EXPECTED = {
     "watched": [
         ("too little sound",), (), (), ("budget broken",), ("budget broken",), ("budget broken", "masked"),
@@ -104,21 +104,21 @@ def test_a_former_mcap_file_keeps_its_images_and_sound_and_is_drawn_anew(tmp_pat
 
 
 @pytest.mark.parametrize(("given", "named"), [("watched.mcap", "x.jsonl"), ("watched.jsonl", "x.mcap")])
-def test_an_upgrade_that_would_lose_images_or_lie_of_its_form_is_refused(given, named, tmp_path, capsys):
+def test_an_upgrade_to_another_form_is_refused(given, named, tmp_path, capsys):
     former_mcap("watched", tmp_path)
     assert main(["log", "upgrade", str(tmp_path / given), str(tmp_path / named)]) == 2
     assert named in capsys.readouterr().err and not (tmp_path / named).exists()
 
 
 def without_model(state: WorldState) -> WorldState:
-    """Return what an array without a model can state: where something sounds, no side, class or risk."""
+    """Return the snapshot of an array without a model: directions of sound without side, class or risk."""
     cues = (RiskCue(None, 0.4, 0.2, None, None, None, None, None),)
     unknown = dict.fromkeys(("status", "hidden_probability", "classification", "direction", "sector_rad"))
     heard = tuple(replace(one, sides=(), **unknown) for one in state.entities)
     return replace(state, cues=cues, entities=heard, relations=(), calibrated=False)
 
 
-def test_what_has_no_side_class_or_risk_is_left_out_and_not_taken_for_zero(tmp_path, capsys):
+def test_unknown_sides_classes_and_risks_are_left_out_and_not_zero(tmp_path, capsys):
     states = [without_model(one) for one in scripted_states()]
     log = write_states(tmp_path / "states.jsonl", states)
     assert [state for _, state in read_log(log)] == states and {one.risk for one in states} == {None}

@@ -1,4 +1,4 @@
-"""OSI, Autoware and ODAS: read back by their own package, or by a parser written from their definitions."""
+"""Exports to OSI, Autoware and ODAS, read by their own packages or by parsers after their definitions."""
 
 import argparse
 import io
@@ -67,7 +67,7 @@ def test_osi_reads_the_trace_and_finds_every_entity(log, tmp_path):
     assert found[-2].moving_object[0].header.tracking_id == last.header.tracking_id
 
 
-def test_osi_reads_its_mcap_under_the_name_that_it_names(log, tmp_path):
+def test_osi_reads_its_mcap_under_its_own_name(log, tmp_path):
     from google.protobuf import __version__ as protobuf
     from osi3trace.osi_trace import OSITrace
 
@@ -86,7 +86,7 @@ def test_osi_reads_its_mcap_under_the_name_that_it_names(log, tmp_path):
     trace.close()
 
 
-# Ranges that OSI's definitions name, by the field.
+# Ranges in OSI's definitions, by field.
 OSI_RANGES = {
     "nanos": (0, 999_999_999), "seconds": (0, math.inf), "probability": (0.0, 1.0), "age": (0.0, math.inf),
     "existence_probability": (0.0, 1.0), "length": (0.0, math.inf), "width": (0.0, math.inf),
@@ -105,7 +105,7 @@ OSI_NEEDED = {
 
 
 def osi_faults(message, place="SensorData"):
-    """Yield what the rules of OSI refuse of a message, and of the messages in it."""
+    """Yield the faults of a message and of the messages in it by the rules of OSI."""
     kind, filled = message.DESCRIPTOR, {field.name: value for field, value in message.ListFields()}
     named = OSI_NEEDED.get(kind.name, "").split()
     needed = [field.name for field in kind.fields] if kind.name in OSI_WHOLE else named
@@ -150,13 +150,13 @@ def test_osi_messages_keep_the_rules_of_its_definitions():
 
 @settings(max_examples=30)
 @given(st.floats(-1.3, 1.3), st.floats(-0.5, 0.5), st.floats(0.0, 15.0), st.floats(-0.3, 0.3))
-def test_a_drive_does_not_move_what_is_seen_across_the_road(azimuth, rate, speed, turning):
+def test_a_moving_ego_does_not_move_a_vehicle_out_of_its_lane(azimuth, rate, speed, turning):
     ego = replace(EGO, speed_mps=speed, yaw_rate_rad_s=turning)
     seen = replace(STATES[-2].entities[0], azimuth_rad=azimuth, azimuth_rate_rad_s=rate)
     state = replace(STATES[-2], entities=(seen,), ego=ego)
     base = osi_sensor_data(state).moving_object[0].base
     x, y, vx, vy = base.position.x, base.position.y, base.velocity.x, base.velocity.y
-    # OSI's velocity is that in the axes of the vehicle: the azimuth changes as it was seen to.
+    # OSI's velocity is relative to the axes of the vehicle, so it gives the observed azimuth rate.
     assert (x * vy - y * vx) / (x * x + y * y) == pytest.approx(rate, abs=1e-9)
     (one,) = lane_objects(state)
     assert one.velocity_mps[0] == pytest.approx(0.0, abs=1e-9), "over ground it stays in its lane"
@@ -172,7 +172,7 @@ def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lan
     assert len(lines) == len(STATES)
     for line, state in zip(lines, STATES, strict=True):
         told = json.loads(line)
-        # The type of ROS is the oracle: no field is missing or unknown, and each value fits.
+        # The type of ROS is the oracle: no field is missing or unknown, and each value is of its type.
         typed = types.message(types.OBJECTS, told)
         assert len(types.typestore().serialize_cdr(typed, types.OBJECTS)) > 20
         again = json.dumps(asdict(typed), default=np.ndarray.tolist)
@@ -196,7 +196,7 @@ def test_autoware_objects_have_the_fields_of_the_message_and_the_path_of_the_lan
 
 @settings(max_examples=20)
 @given(st.floats(-3.1, 3.1), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0))
-def test_an_object_stands_in_the_map_where_the_car_sees_it_and_is_as_uncertain_as_both(yaw, x, y):
+def test_objects_in_the_map_have_the_uncertainty_of_object_and_ego(yaw, x, y):
     ego = replace(EGO, position_m=(x, y), yaw_rad=yaw, covariance=((0.09, 0, 0), (0, 0.09, 0), (0, 0, 0.01)))
     known = tuple(map(tuple, np.diag([0.25, 1.0, 1.0, 1.0]).tolist()))
     certain = replace(PLACED.entities[0], covariance=known)
@@ -220,13 +220,13 @@ def exporting(export, live=True, odometry=None):
 
 @pytest.mark.parametrize("live", [False, True])
 @pytest.mark.parametrize("ego", [None, replace(EGO, localised=False)])
-def test_objects_of_a_car_that_is_nowhere_in_the_map_are_refused(ego, live, tmp_path):
+def test_objects_without_a_pose_in_the_map_are_refused(ego, live, tmp_path):
     nowhere, out = replace(HIDDEN, ego=ego), tmp_path / "objects.jsonl"
     words = "expected odometry with x_m, y_m and yaw_rad"
     with pytest.raises(InvalidArgumentError, match=words), exporting(f"autoware={out}", live) as exports:
         exports.state(nowhere)
     assert live or not out.exists()
-    # A pose that is lost on the way, or that a running localiser has not sent yet, ends no run.
+    # A pose that is lost during the run, or not known yet, does not end the run.
     for first, odometry in [(HIDDEN, None)] + [(nowhere, "127.0.0.1:9000")] * live:
         with exporting(f"autoware={out}", live, odometry) as exports:
             for state in (first, replace(nowhere, seq=90), PLACED):
@@ -235,7 +235,7 @@ def test_objects_of_a_car_that_is_nowhere_in_the_map_are_refused(ego, live, tmp_
 
 
 @pytest.mark.parametrize("target", ["autoware=out.jsonl", "mot=out.txt", "osi=out.osi", "osi=out.mcap"])
-def test_what_a_live_run_has_exported_is_there_while_it_goes_on(target, tmp_path, monkeypatch):
+def test_files_of_a_live_run_can_be_read_during_the_run(target, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with exporting(target) as exports:
         for seq in range(40):
@@ -245,7 +245,7 @@ def test_what_a_live_run_has_exported_is_there_while_it_goes_on(target, tmp_path
 
 
 def osi_messages(kept, target):
-    """Return the messages of a trace that was not ended."""
+    """Return the messages of an unfinished trace."""
     found = []
     if target.endswith("mcap"):
         reader = NonSeekingReader(io.BytesIO(kept))
@@ -258,7 +258,7 @@ def osi_messages(kept, target):
 
 
 def stops_for(message, least_confidence=0.05, kinds=(0, 1, 2, 3, 4, 5, 6)):
-    """Return the objects that Autoware's intersection module minds, of unknown kind as well."""
+    """Return the objects for which Autoware's intersection module stops, including unknown ones."""
     return [
         one
         for one in message["objects"]
@@ -267,7 +267,7 @@ def stops_for(message, least_confidence=0.05, kinds=(0, 1, 2, 3, 4, 5, 6)):
     ]
 
 
-def test_an_existence_of_a_twentieth_stops_nobody():
+def test_an_existence_of_five_per_cent_stops_no_planner():
     faint = replace(HIDDEN.entities[0], existence_probability=0.05, hidden_probability=0.05, sides=())
     likely = replace(faint, existence_probability=0.9, hidden_probability=0.9)
     cue = next(one for one in HIDDEN.cues if one.direction == faint.direction)
@@ -278,19 +278,19 @@ def test_an_existence_of_a_twentieth_stops_nobody():
         (path,) = message["objects"][0]["kinematics"]["predicted_paths"]
         assert path["confidence"] == pytest.approx(within)
     in_view = replace(PLACED, entities=(replace(PLACED.entities[0], existence_probability=0.04),))
-    assert not stops_for(autoware_objects(in_view)), "of one in view the existence alone counts"
+    assert not stops_for(autoware_objects(in_view)), "only the existence of a visible vehicle matters"
 
 
 @settings(max_examples=30)
 @given(st.floats(-3.1, 3.1), st.floats(0.001, 0.05), st.floats(3.0, 30.0))
-def test_who_is_only_heard_keeps_the_azimuth_and_its_deviation_in_the_lane(azimuth, std, crossing):
+def test_a_vehicle_without_a_range_keeps_its_azimuth_and_deviation_in_the_lane(azimuth, std, crossing):
     entity = replace(HIDDEN.entities[0], azimuth_rad=azimuth, azimuth_std_rad=std)
     (one,) = lane_objects(replace(HIDDEN, entities=(entity,)), crossing)
     x, y = one.position_m
     assert math.atan2(y, x) == pytest.approx(azimuth, abs=1e-9)
     if abs(azimuth) < math.radians(79.0):
         assert x == pytest.approx(crossing)
-    # Linear propagation back: the gradient of atan2 gives the deviation of the azimuth again.
+    # By linear propagation, the gradient of atan2 gives the deviation of the azimuth again.
     gradient = np.array([-y, x]) / (x * x + y * y)
     assert math.sqrt(gradient @ one.covariance @ gradient) == pytest.approx(std, rel=1e-6)
     assert np.linalg.eigvalsh(one.covariance).min() >= -1e-9
@@ -310,7 +310,7 @@ def test_sizes_and_the_order_of_labels_are_those_of_the_likeliest_class():
 
 
 class OdasStudio:
-    """The rule by which ODAS Studio's socket handler takes messages out of what arrives."""
+    """The rule by which ODAS Studio's socket handler splits the received text into messages."""
 
     def __init__(self):
         self.rest, self.messages = "", []
@@ -322,7 +322,7 @@ class OdasStudio:
             self.messages.append(opened if "}" in opened[-3:-1] else opened + "}")
 
 
-def test_a_listener_that_leaves_does_not_end_a_live_run(monkeypatch):
+def test_a_receiver_that_disconnects_does_not_end_a_live_run(monkeypatch):
     monkeypatch.setattr(other_stacks, "AGAIN_S", 0.05)
     server = socket.create_server(("127.0.0.1", 0))
     address = f"127.0.0.1:{server.getsockname()[1]}"
@@ -343,7 +343,7 @@ def test_a_listener_that_leaves_does_not_end_a_live_run(monkeypatch):
         again.close()
 
 
-def test_a_listener_that_takes_nothing_holds_nobody_up():
+def test_a_receiver_that_reads_nothing_delays_no_state():
     server = socket.create_server(("127.0.0.1", 0))
     target = server.getsockname()
     with server, other_stacks.LiveSender(target, socket.create_connection(target, 10.0)) as sender:
@@ -388,7 +388,7 @@ def test_odas_messages_are_whole_however_the_stream_is_cut(vehicles, cuts):
     assert sources == [min(many, 4) for many in vehicles]
 
 
-def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgotten():
+def test_numbers_of_tracks_are_used_once_and_forgotten():
     tracks, numbers = other_stacks.OdasTracks(), []
     with_entity = next(state for state in STATES if state.entities)
     for hop in range(200):
@@ -398,8 +398,8 @@ def test_numbers_of_tracks_are_never_given_again_and_those_of_the_gone_are_forgo
     assert numbers == list(range(1, 201)) and not tracks._numbers.of(replace(with_entity, entities=()))
 
 
-def test_mot_text_has_a_row_for_what_has_a_place(tmp_path):
-    """Ten numbers a row; the second of three states has no distance, and one number goes on."""
+def test_mot_text_has_a_row_for_each_position(tmp_path):
+    """A row has ten numbers; the second of three states has no distance, and one track keeps its number."""
     only_heard = replace(HIDDEN.entities[0], id="heard")
     lost = replace(only_heard, id="a")
     first, last, other = (

@@ -39,13 +39,13 @@ def test_every_exported_name_has_an_example_that_runs(name):
     assert not re.search(r"\w -{4,}", value.__doc__), "a heading that a re-wrapped paragraph swallowed"
 
 
-def test_all_names_together_can_be_learned():
+def test_the_number_of_exported_names_is_limited():
     assert len(worldstate.__all__) <= 25
     assert sum(map(len, reference.exports().values())) <= 250
 
 
 @pytest.mark.parametrize("name", worldstate._FORMER)
-def test_a_name_that_has_moved_warns_and_names_its_package(name):
+def test_a_moved_name_gives_a_warning_with_its_package(name):
     told = rf"^worldstate\.{name} is worldstate\.\w+\.{name}$"
     with pytest.warns(DeprecationWarning, match=told) as caught:
         value = getattr(worldstate, name)
@@ -59,12 +59,12 @@ def test_a_vehicle_is_not_who():
     folders = ("abduction", "adapters", "frontend", "simulation", "worldstate", "lab/worldstate_lab", "docs")
     texts = [path for name in folders for path in (ROOT / name).rglob("*") if path.suffix in (".py", ".md")]
     words = re.compile(r"\b(who|whoever|whom|somebody|nobody|anybody)\b", re.IGNORECASE)
-    # What is left speaks of people: children who call, engineers who build.
+    # The remaining ones are about people: children who call, engineers who build.
     counted = [f"{path.name}: {word}" for path in texts for word in words.findall(path.read_text("utf-8"))]
     assert len(counted) <= 20, counted
 
 
-# Words that pages and messages use in a sense of ours.
+# Words that have a special meaning in pages and messages.
 OURS = """absence, advisory, arm, block, budget, chance, co-evidence, context, cue, domain, ego,
 ensemble, entity, explanation, feature, frame, guard, hand-over, heard, hop, image, lead time, look,
 looming, masked, miss rate, onset, pass, phantom, preset, prominence, reference, risk, scan, sequence,
@@ -80,7 +80,7 @@ def test_every_term_of_ours_is_in_the_glossary():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_can_be_read_as_text(page):
-    """Prose within 140 characters, but tables and commands are as long as they are; links with a text."""
+    """Lines of prose have at most 140 characters, and links have a text; tables and commands may exceed it."""
     text = page.read_text(encoding="utf-8")
     lines = (line for line in text.splitlines() if not line.startswith(("|", "    ")))
     assert [line for line in lines if len(line) > 140] == []

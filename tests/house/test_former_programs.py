@@ -1,7 +1,7 @@
-"""Programs of the tutorials, examples and pages of 0.3, shortened to what has changed since, still run.
+"""Programs of the tutorials, examples and pages of version 0.3, shortened, still run.
 
-Each takes the names, arguments and attributes that 0.3 documented. What has another name now draws one
-`DeprecationWarning`; what keeps its name draws none.
+Each program uses names, arguments and attributes that version 0.3 documented. Former names give one
+`DeprecationWarning`.
 """
 
 import math
@@ -50,7 +50,7 @@ def headlights() -> Iterator[Measurement]:
 
 
 def settings_by_their_former_names(folder: Path) -> Iterator[str]:
-    """Give the filter its thresholds, as the docstring of `FilterSettings` had it."""
+    """Set the thresholds of the filter as in the former docstring of `FilterSettings`."""
     settings = FilterSettings(1.0, 0.4, birth_probability=0.3, death_probability=0.2, delete_existence=0.1)
     now = FilterSettings(street=StreetModel(look_s=0.4, birth=0.3, death=0.2))
     former, today = WorldFilter(settings=settings), WorldFilter(settings=now)
@@ -60,7 +60,7 @@ def settings_by_their_former_names(folder: Path) -> Iterator[str]:
 
 
 def tutorial_another_modality(folder: Path) -> Iterator[str]:
-    """Print the numbers to act on by light alone, then where a message places a vehicle."""
+    """Print risks from light alone, then a vehicle whose position is in a message."""
     world = WorldFilter()
     for one in headlights():
         world = world.update(one)
@@ -78,7 +78,7 @@ def tutorial_another_modality(folder: Path) -> Iterator[str]:
 
 
 def tutorial_embed(folder: Path) -> Iterator[str]:
-    """Deliver late and twice, and go on from a checkpoint."""
+    """Deliver measurements late and twice, and continue from a checkpoint."""
     in_order, world = WorldFilter(), WorldFilter()
     for one in headlights():
         in_order = in_order.update(one)
@@ -94,7 +94,7 @@ def tutorial_embed(folder: Path) -> Iterator[str]:
 
 
 def example_v2x_beacon(folder: Path) -> Iterator[str]:
-    """Weigh the power of messages against the distance they claim, with a camera and a threshold."""
+    """Compare the power of messages with the distance in them, with a camera and a threshold."""
     world = WorldFilter(policy=replace(uncalibrated_policy(), gamma=0.7))
     for hop in range(1, 61):
         y_m = 7.0 + 8.0 * (4.0 - hop / 10.0)
@@ -117,7 +117,7 @@ def example_v2x_beacon(folder: Path) -> Iterator[str]:
 
 
 def example_own_loop(folder: Path) -> Iterator[str]:
-    """Hear with one's own array, model and detector; the filter has the settings that it comes with."""
+    """Use an array, a model and a detector of one's own, and the default settings of the filter."""
     own = runpy.run_path(str(EXAMPLES / "own_loop.py"))
     array, camera, rng = own["my_array"](), own["LiveCamera"](own["BrightBlocks"]()), np.random.default_rng(1)
     adapter = AcousticAdapter(array, own["RATE_HZ"], own["PatternSignature"](), vision=camera)
@@ -131,7 +131,7 @@ def example_own_loop(folder: Path) -> Iterator[str]:
 
 
 HIDDEN_THEN_VISIBLE = r"(?s).*risk [\d.]+ hidden (\w{8})\n.*risk [\d.]+ visible \1\n?.*"
-# What each prints, by its kind.
+# Pattern of the output of each program.
 PRINTED: dict[Callable[[Path], Iterator[str]], str] = {
     settings_by_their_former_names: r"(\d entities, as by the street model: True\n){12}",
     tutorial_another_modality: r"(False, None, True\n(risk (left|right) 0\.\d\d, (True|False), None, "
@@ -144,7 +144,7 @@ WARNED = {settings_by_their_former_names: r"give birth, death, look_s to StreetM
 
 
 @pytest.mark.parametrize("program", PRINTED, ids=lambda one: one.__name__)
-def test_a_program_of_0_3_runs_with_a_warning_for_what_has_another_name(program, tmp_path) -> None:
+def test_a_program_of_0_3_runs_with_a_warning_for_renamed_parameters(program, tmp_path) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         printed = "\n".join(program(tmp_path)) + "\n"

@@ -1,4 +1,4 @@
-"""The layout itself: what is packaged, and who may import whom."""
+"""The layout of the project: packages, and the imports between them."""
 
 import re
 import shutil
@@ -66,7 +66,7 @@ def modules_of_the_product() -> str:
 @pytest.mark.parametrize(
     "package", ["filterpy", "gtsam", "networkx", "numpy", "scipy", "sklearn", "soundfile"]
 )
-def test_what_the_project_is_built_on_is_imported_by_the_product(package):
+def test_the_product_imports_its_main_packages(package):
     said = rf"(^\s*(import|from) {package}\b|optional\(\"{package}\b)"
     assert re.search(said, modules_of_the_product(), flags=re.MULTILINE)
 
@@ -118,7 +118,7 @@ assert len(Listener(ovad_array(), 48_000).push(np.random.default_rng(0).normal(0
 
 
 @pytest.mark.long
-def test_a_stream_is_heard_without_the_parts_of_scipy_that_are_slow_to_import():
+def test_a_stream_is_processed_without_the_slow_parts_of_scipy():
     parts = "stats", "signal", "fft", "ndimage", "special", "optimize", "linalg"
     slow = {f"scipy.{part}" for part in parts}
     script = f"{HEARD}\nimport sys; print(*sorted({slow!r} & set(sys.modules)))"
@@ -137,14 +137,14 @@ def test_every_exported_name_is_the_one_of_its_home():
         assert list(package.__all__) == sorted(set(package.__all__)), name
         for exported in package.__all__:
             value = getattr(package, exported)
-            # A submodule of the same name would take its place once somebody imports that.
+            # An imported submodule of the same name would replace it.
             assert not isinstance(value, ModuleType), f"{name}.{exported}"
             homes.setdefault(exported, value)
             assert value is homes[exported], f"{name}.{exported} is another thing elsewhere"
             home = sys.modules[getattr(value, "__module__", None) or name]
             assert getattr(home, exported, value) is value
     assert sum(len(package.__all__) for package in packages.values()) <= 250
-    # Thirty, and `hear`, which a program over a corpus begins with.
+    # Thirty names, and `hear` for a corpus.
     assert 20 <= len(packages["worldstate"].__all__) <= 31
 
 
@@ -163,7 +163,7 @@ def test_it_runs_as_a_module_and_as_a_command_and_names_its_version(command):
     assert done.stdout.split() == ["worldstate", worldstate.__version__]
 
 
-# Stands for pip-audit, which takes a list without versions, and passes over unknown ones without --strict.
+# A stand-in for pip-audit, which accepts a list without versions and skips unknown ones without --strict.
 AUDITOR = """#!/bin/sh
 mkdir -p out/audit/bin && cp "$0" out/audit/bin/pip && cp "$0" out/audit/bin/pip-audit
 case "$0 $*" in *pip-audit*--strict*-r*locked.txt*) touch audited ;; esac

@@ -239,7 +239,7 @@ def test_a_full_disk_gives_a_notice_and_readable_files(street, tmp_path, name, o
     file = tmp_path / name
     done = subprocess.run(
         [*COMMAND, *played(street, f"{option}{file}", "--duration", "60", "--speed", "20", "--json")],
-        # A limit of the file size, which the kernel reports as it reports a full disk.
+        # A limit of the file size; the kernel reports it like a full disk.
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)),
         capture_output=True,
         text=True,

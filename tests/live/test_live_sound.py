@@ -336,7 +336,7 @@ def test_the_command_records_the_channels_of_microphones(stand_in, noise, tmp_pa
     assert json.loads(capsys.readouterr().out)["states"] == 3
     assert stand_in.stream.channels == opened
     samples, _ = soundfile.read(kept)
-    assert samples.shape[1] == opened, "what is kept is as the card gave it, and chosen again when it is read"
+    assert samples.shape[1] == opened, "the file has all channels of the card; reading it selects them again"
     soundfile.write(own, samples[:, [one - 1 for one in chosen]], RATE, subtype="PCM_24")
     (tmp_path / "two.csv").write_text("0,0.1,0\n0,-0.1,0.05")
     found = []

@@ -177,7 +177,7 @@ def test_turned_boards_are_reported_and_array_files_kept(tmp_path, caplog, capsy
     eighth = (0.0, 0.0, float(np.sin(np.pi / 8.0)), float(np.cos(np.pi / 8.0)))
     skew = board_bag(tmp_path / "skew", [("base_link", "/mics", (1.0, 0.0, 1.5), eighth)])
     assert main(["run", str(skew), "--array", "respeaker-4"]) == 0
-    assert "respeaker-4 is turned" in caplog.text, "what is compared with the model is the board as it stands"
+    assert "respeaker-4 is turned" in caplog.text, "the board is compared with the model after its rotation"
     assert "not the array of the model" in caplog.text and "no model" in capsys.readouterr().out
     own = tmp_path / "respeaker.json"
     own.write_text(json.dumps(BOARD.positions_m.tolist()))

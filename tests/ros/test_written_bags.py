@@ -1,4 +1,4 @@
-"""Written bags of ROS 2: states and recordings, as other readers find them."""
+"""Written bags of ROS 2: states and recordings, read by other programs."""
 
 import json
 import math
@@ -94,7 +94,7 @@ def test_objects_in_the_bag_are_those_of_autoware(written):
 def test_markers_replace_those_of_the_last_scene(written):
     for _, _, message in read_by_others(written, "markers"):
         first, *drawn = message.markers
-        assert first.action == 3, "all that was there goes"
+        assert first.action == 3, "all earlier markers are deleted"
         assert len({(one.ns, one.id) for one in drawn}) == len(drawn), "RViz would draw one of two"
         assert all(max(one.scale.x, one.scale.y, one.scale.z) > 0.0 and one.color.a > 0.0 for one in drawn)
     scene = scene_update(STATES[-1]).entities
@@ -114,7 +114,7 @@ def test_the_bag_of_a_recording_has_the_frames_of_array_and_camera(bag_of_approa
     """The chain of frames ends at `base_link`; rotations of SciPy are the oracle."""
     ((_, stamp_ns, told),) = read_by_others(bag_of_approach, "/tf_static")
     read = read_by_others(bag_of_approach)
-    assert stamp_ns == min(time for _, time, _ in read), "before all that stands in these frames"
+    assert stamp_ns == min(time for _, time, _ in read), "before all messages in these frames"
     found = {one.child_frame_id: one for one in told.transforms}
     assert {one.header.frame_id for one in told.transforms} == {"base_link"}
     frames = {message.header.frame_id for name, _, message in read if name.endswith(("audio", "detections"))}
@@ -130,7 +130,7 @@ def test_the_bag_of_a_recording_has_the_frames_of_array_and_camera(bag_of_approa
     up = camera.pitch_rad
     assert turn.apply([1.0, 0.0, 0.0]) == pytest.approx([math.cos(up), 0.0, math.sin(up)])
     assert turn.apply([0.0, 1.0, 0.0]) == pytest.approx([0.0, 1.0, 0.0])
-    # 1 is TRANSIENT_LOCAL, without which a player sends the one message only to existing subscribers.
+    # 1 is TRANSIENT_LOCAL; otherwise a player sends the one message only to existing subscribers.
     assert (bag_of_approach / "metadata.yaml").read_text().count("durability: 1") == 1
 
 
@@ -146,11 +146,11 @@ def test_a_recording_and_its_bag_give_the_same_states(approach, bag_of_approach,
         assert other["context"]["ego_speed_mps"] == 0.0, "the odometry of a standing ego"
         for cue, as_before in zip(one["cues"], other["cues"], strict=True):
             assert (cue["advisory"] is None) == (as_before["advisory"] is None)
-            # Seconds since 1970 have a resolution of 240 ns, in which a belief changes by at most 1 per s,
-            # and the learned traffic, which is published in steps, may take its next step.
+            # Seconds since 1970 have a resolution of 240 ns. A belief changes by at most 1 per second, and
+            # the learned traffic, which is published in steps, may take its next step.
             assert cue["risk"] == pytest.approx(as_before["risk"], abs=1e-4)
         assert [one["status"] for one in one["entities"]] == [one["status"] for one in other["entities"]]
-    # The bag has no pose in the map, without which there are no objects for a planner.
+    # The bag has no pose in the map, so there are no objects for a planner.
     assert len(read_by_others(bag)) == 3 * len(of_bag)
     assert main(["log", "replay", str(bag), "--out", str(replayed)]) == 0
     assert replayed.read_bytes() == again.read_bytes()
@@ -183,7 +183,7 @@ def test_the_bag_of_a_drive_has_its_speed(tmp_path, capsys):
     soundfile.write(folder / "out_multi.wav", np.random.default_rng(0).uniform(-0.1, 0.1, (8000, 56)), 8000)
     bag = [str(folder), str(tmp_path / "unknown")]
     assert main(["sim", "to-bag", *bag, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["odometry"] is False, "OVAD says that it moves, not how fast"
+    assert json.loads(capsys.readouterr().out)["odometry"] is False, "OVAD states that it moves, but no speed"
     assert read_bag(tmp_path / "unknown").ego is None
     (folder / "truth.json").write_text(json.dumps({"ego": {"speed_mps": [4.0] * 5 + [2.0] * 6}}))
     assert main(["sim", "to-bag", str(folder), str(tmp_path / "driven"), "--start", "3"]) == 0
