@@ -80,7 +80,7 @@ def test_every_term_of_ours_is_in_the_glossary():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_can_be_read_as_text(page):
-    """Lines of prose have at most 140 characters, and links have a text; tables and commands may exceed it."""
+    """Lines of prose have at most 140 characters, and links have a text; tables may be longer."""
     text = page.read_text(encoding="utf-8")
     lines = (line for line in text.splitlines() if not line.startswith(("|", "    ")))
     assert [line for line in lines if len(line) > 140] == []
