@@ -40,5 +40,4 @@ def arrival(first: int, level: float = 20.0) -> Iterator[Measurement]:
     for number in range(100):
         seen, loud = 80 <= number < 92, "left" if 60 <= number < 80 else None
         one = heard(first + number, loud, PRESENT if seen else ABSENT, level)
-        boxes = (car(0.53 - 0.04 * (number - 80)),) if seen else ()
-        yield replace(one, sightings=boxes)
+        yield replace(one, sightings=(car(0.53 - 0.04 * (number - 80)),) if seen else ())

@@ -68,8 +68,7 @@ def test_the_overview_of_all_commands_fits_on_one_screen(capsys):
 
 
 def test_run_has_at_most_twenty_options():
-    options = {one for one in PROGRAM.parser("run")._option_string_actions if one.startswith("--")}
-    assert len(options) <= 20
+    assert len({one for one in PROGRAM.parser("run")._option_string_actions if one.startswith("--")}) <= 20
 
 
 @pytest.mark.parametrize(
@@ -252,8 +251,7 @@ def test_run_writes_one_snapshot_per_hop(approach, tmp_path, capsys):
     summary = json.loads(capsys.readouterr().out)
     snapshots = [json.loads(line) for line in states.read_text().splitlines()]
     assert len(snapshots) == summary["hops"]
-    stamps = [snapshot["stamp_ns"] for snapshot in snapshots]
-    assert np.allclose(np.diff(stamps), 1e8, atol=3e4)
+    assert np.allclose(np.diff([snapshot["stamp_ns"] for snapshot in snapshots]), 1e8, atol=3e4)
     validator = jsonschema.Draft202012Validator(snapshot_schema())
     assert [error.message for one in snapshots for error in validator.iter_errors(one)] == []
     onset_s = next(one["stamp_ns"] for one in snapshots if any(cue["advisory"] for cue in one["cues"])) / 1e9

@@ -25,8 +25,7 @@ def command(tmp_path):
 @pytest.mark.slow
 def test_commissioning_of_four_microphones_resumes(command, tmp_path, capsys, refused):
     out, figure, report = tmp_path / "model.json", tmp_path / "exam.png", tmp_path / "exam.json"
-    more = ["--figure", str(figure), "--report", str(report), "--mounting-errors"]
-    assert main([*command, *more]) == 0
+    assert main([*command, "--figure", str(figure), "--report", str(report), "--mounting-errors"]) == 0
     assert "unfit for use" in capsys.readouterr().out
     model = read_model(out)
     assert main(["model", "show", str(out)]) == 0
@@ -38,8 +37,7 @@ def test_commissioning_of_four_microphones_resumes(command, tmp_path, capsys, re
     alone = sum(value for name, value in told.items() if name.startswith("approaches_"))
     assert sum(one.approaches for one in model.provenance.kinds) == alone
     assert model.provenance.exam["detected"] == told["detected"]
-    shipped = read_model().provenance.real
-    assert model.provenance.real == tuple(one for one in shipped if not one.own) != ()
+    assert model.provenance.real == tuple(one for one in read_model().provenance.real if not one.own) != ()
     assert card.count("no real recording of such an array and motion; ") == len(model.provenance.real)
     assert told["approaches"] >= 1 and told["hazard_free_hours"] > 0.03 and figure.stat().st_size > 10_000
     assert told["mounting"]["as mounted"]["detected"] == told["detected"]

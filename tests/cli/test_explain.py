@@ -197,11 +197,9 @@ def test_partial_logs_are_explained_and_replayed(states, onset, tmp_path, capsys
             log.write_bytes(extra + b"".join(lines[first:]) + lines[0][:100])
             assert main(["explain", str(log), "--json"]) == 0
             told = json.loads(capsys.readouterr().out)
-            advised = told["advisories"]
-            assert [one["since_ns"] for one in advised] == [onset * 10**8]
+            assert [one["since_ns"] for one in told["advisories"]] == [onset * 10**8]
             assert told["time_s"] == pytest.approx(max(onset, first + 1) / 10)
-            at_onset = told["sides"]["left"]["evidence_at_onset"]
-            assert (at_onset is None) == (first >= onset)
+            assert (told["sides"]["left"]["evidence_at_onset"] is None) == (first >= onset)
             assert main(["log", "replay", str(log), "--json"]) == 0
             replayed = json.loads(capsys.readouterr().out)
             assert replayed["states"] == 15 - first and replayed["advisory_onsets_s"] == [onset / 10]

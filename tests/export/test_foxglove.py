@@ -249,8 +249,7 @@ def test_a_rerun_recording_has_the_scene_the_power_and_the_images(tmp_path):
     paths = set(re.findall(r" - (/worldstate/\S*) - ", printed))
     assert "/worldstate/snapshot" in paths
     for name in {item.id for state in STATES for item in scene_update(state).entities}:
-        below = f"/worldstate/scene/{name.replace(' ', '/')}/"
-        assert any(path.startswith(below) for path in paths), name
+        assert any(path.startswith(f"/worldstate/scene/{name.replace(' ', '/')}/") for path in paths), name
     for kind in ("Mesh3D:triangle_indices", "LineStrips3D:strips", "Points3D:labels", "Clear:is_recursive"):
         assert kind in printed
     with log_messages.rerun_file(out) as write:
@@ -317,8 +316,7 @@ def test_a_recording_plays_no_faster_than_its_sound():
         for state in states[:4]:
             for message in state_messages(state):
                 send(message)
-        lasted_s = (states[3].stamp_ns - states[0].stamp_ns) / 1e9
-        assert time.monotonic() - begun_s >= lasted_s
+        assert time.monotonic() - begun_s >= (states[3].stamp_ns - states[0].stamp_ns) / 1e9
 
 
 def test_a_taken_port_raises_an_error():

@@ -54,8 +54,7 @@ def former_mcap(name: str, folder: Path) -> Path:
     with mcap_file(path) as write:
         for line in former_log(name, folder).read_bytes().splitlines():
             stamp_ns = json.loads(line)["stamp_ns"]
-            texts = {"snapshot": line, "scene": b'{"deletions": [], "entities": []}'}
-            for topic, data in texts.items():
+            for topic, data in {"snapshot": line, "scene": b'{"deletions": [], "entities": []}'}.items():
                 write(SimpleNamespace(topic=f"/worldstate/{topic}", stamp_ns=stamp_ns, data=data, **form))
             write(image_message(stamp_ns, b"a jpeg"))
             write(sound_message(stamp_ns, np.zeros(80, np.float32), 8000))

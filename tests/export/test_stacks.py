@@ -413,8 +413,7 @@ def test_mot_text_has_a_row_for_each_position(tmp_path):
     assert table.shape == (3, 10)
     assert table[:, 0].tolist() == [1, 3, 3] and (table[:, 2:6] == -1).all()
     assert table[:, 1].tolist() == [1, 1, 3], "a number stays with its entity"
-    found = [[0.9, 8.0, 4.4, 0.0], [0.9, 7.0, 4.0, 0.0], [0.25, 9.0, -3.0, 0.0]]
-    assert table[:, 6:].tolist() == found
+    assert table[:, 6:].tolist() == [[0.9, 8.0, 4.4, 0.0], [0.9, 7.0, 4.0, 0.0], [0.25, 9.0, -3.0, 0.0]]
 
 
 def test_a_missing_listener_and_a_crossing_at_the_ego_raise_an_error(log, tmp_path, refused):

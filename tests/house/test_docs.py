@@ -127,8 +127,7 @@ def test_files_that_a_page_names_exist(page):
 
 
 def test_pages_are_those_that_make_figures_writes():
-    texts = figures.pages()
-    assert [path.name for path, text in texts.items() if path.read_text("utf-8") != text] == []
+    assert [path.name for path, text in figures.pages().items() if path.read_text("utf-8") != text] == []
     assert [page.name for page in PAGES if re.search(r"<!--|\{\{", page.read_text("utf-8"))] == []
 
 

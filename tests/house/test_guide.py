@@ -207,5 +207,4 @@ def test_the_notebook_prints_its_stored_output():
 
 def test_the_gallery_has_every_figure_with_a_caption():
     page = (FOLDER / "gallery.md").read_text(encoding="utf-8")
-    captions = re.findall(r"\(figures/(\w+)\.svg\)\n\n\*Look at ", page)
-    assert captions == [script.stem for script in SCRIPTS]
+    assert re.findall(r"\(figures/(\w+)\.svg\)\n\n\*Look at ", page) == [script.stem for script in SCRIPTS]

@@ -20,8 +20,7 @@ SIBLINGS = ["abduction", "adapters", "frontend", "simulation"]
 
 def printed_by(*words: str) -> str:
     """Return the output of Python with these arguments."""
-    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True)
-    return done.stdout
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
 
 
 def packages_in_tree() -> set[str]:

@@ -56,8 +56,7 @@ def stamp(number):
 @pytest.fixture
 def camera():
     pipe = RawPcm(io.BytesIO(), 48_000, 56, "f32")
-    source = open_source(pipe, array=ovad_array(), camera=CAMERA, detections=NO_LOOKS)
-    return source.camera_channel()
+    return open_source(pipe, array=ovad_array(), camera=CAMERA, detections=NO_LOOKS).camera_channel()
 
 
 class Fixed:

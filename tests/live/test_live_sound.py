@@ -254,14 +254,6 @@ def stand_in(monkeypatch):
     return card
 
 
-@pytest.fixture
-def noise(stand_in):
-    """Return 1.5 s of noise that the device gives."""
-    sound = np.random.default_rng(5).normal(0.0, 0.1, (60, LENGTH, 4)).astype(np.float32)
-    stand_in.blocks = [(block, 1.0 + number / 40, False) for number, block in enumerate(sound)]
-    return sound
-
-
 def recorded(module, *blocks):
     """Return the sound and samples of blocks: value, time of capture, overflow."""
     module.blocks = [(np.full((LENGTH, 4), value), *about) for value, *about in blocks]
@@ -327,7 +319,9 @@ def test_missing_packages_and_libraries_raise_an_error(monkeypatch):
 
 
 @pytest.mark.parametrize(("chosen", "opened"), [([4, 2], 4), ([3, 1], 3)])
-def test_the_command_records_the_channels_of_microphones(stand_in, noise, tmp_path, capsys, chosen, opened):
+def test_the_command_records_the_channels_of_microphones(stand_in, tmp_path, capsys, chosen, opened):
+    sound = np.random.default_rng(5).normal(0.0, 0.1, (60, LENGTH, 4))
+    stand_in.blocks = [(block, 1.0 + number / 40, False) for number, block in enumerate(sound)]
     positions_m = [[0, 0.1, 0], [0, -0.1, 0.05]]
     array, kept, own = tmp_path / "mics", tmp_path / "kept.wav", tmp_path / "chosen.wav"
     array.write_text(json.dumps({"positions_m": positions_m, "channels": chosen}))
@@ -340,8 +334,8 @@ def test_the_command_records_the_channels_of_microphones(stand_in, noise, tmp_pa
     soundfile.write(own, samples[:, [one - 1 for one in chosen]], RATE, subtype="PCM_24")
     (tmp_path / "two.csv").write_text("0,0.1,0\n0,-0.1,0.05")
     found = []
-    for sound, positions in ((kept, array), (own, tmp_path / "two.csv")):
+    for file, positions in ((kept, array), (own, tmp_path / "two.csv")):
         out = tmp_path / "b.csv"
-        assert main(["array", "bearings", str(sound), "--array", str(positions), "--out", str(out)]) == 0
+        assert main(["array", "bearings", str(file), "--array", str(positions), "--out", str(out)]) == 0
         found.append(out.read_text())
     assert found[0] == found[1]

@@ -85,8 +85,7 @@ def test_permanent_delays_are_losses(places, length_ns, jitter):
     missing, _ = lost_before(stamps, np.full(len(kept), float(length_ns)))
     assert abs(missing.sum() / length_ns - len(places)) <= (0.4 if jitter else 1e-6)
     if not jitter:
-        steps = np.diff(kept, prepend=-1) - 1
-        np.testing.assert_allclose(missing / length_ns, steps, atol=1e-6)
+        np.testing.assert_allclose(missing / length_ns, np.diff(kept, prepend=-1) - 1, atol=1e-6)
 
 
 @pytest.mark.parametrize("first_late_s", [0.0, 0.3, 2.5])
@@ -103,8 +102,7 @@ def test_the_first_sample_is_not_later_than_later_messages_allow(first_late_s):
 @settings(max_examples=20, deadline=None)
 def test_a_repeated_bag_continues_the_count(passes, count):
     stamps, spans = np.tile(even(count)[0], passes), even(count * passes)[1]
-    found = begins_again(stamps, spans)
-    assert found == [(k * count, k * count * 10 * MS) for k in range(1, passes)]
+    assert begins_again(stamps, spans) == [(k * count, k * count * 10 * MS) for k in range(1, passes)]
 
 
 SOUND = np.random.default_rng(1).integers(-9000, 9000, (6 * 8000, 4), dtype=np.int16)
