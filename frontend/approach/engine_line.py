@@ -16,10 +16,10 @@ from scipy import ndimage
 from worldstate.ground import InvalidArgumentError, finite_array, in_range
 from worldstate.ground.typing import Complex128Array, FloatArray, IndexArray
 
+from .tone import MEDIAN_OF_EXPONENTIAL
+
 # Half way between two bins, the Hann window loses 1.4 dB without padding and 0.1 dB with fourfold padding.
 ZERO_PADDING = 4
-# Ratio of median and mean of an exponential variable: converts a median of powers to the noise power.
-MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 BAND_HIGH_HZ = 1200.0  # Highest partial used
 WINDOW_S, STEP_S = 0.25, 0.1  # Analysis window (Hann) and its step
 _MOST_RATE_HZ = 0.4  # Largest relative change of the fundamental, |df/dt| / f, per second

@@ -211,7 +211,7 @@ _TOLERANCE, _STEPS = 1e-4, 3
 # Lowest frequency in periods per window; below, a tone cannot be distinguished from an offset.
 _FEWEST_PERIODS = 4.0
 # Ratio of median and mean of an exponential variable: converts a median of powers to the noise power.
-_MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
+MEDIAN_OF_EXPONENTIAL = float(np.log(2.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,7 +346,7 @@ class _Spectrum:
         below = power[max(centre - outer, 1) : max(centre - inner, 1)]
         above = power[centre + inner : centre + outer]
         around = np.sort(np.concatenate([below, above]))
-        return float(around[len(around) // 2]) / _MEDIAN_OF_EXPONENTIAL + _least(power)
+        return float(around[len(around) // 2]) / MEDIAN_OF_EXPONENTIAL + _least(power)
 
     def beside(self, rest: FloatArray, omega: float) -> float:
         """Return the mean power of the residual near a removed line, within the reach of its lobes."""

@@ -32,8 +32,8 @@ from worldstate.ground.errors import OutOfDomainError
 from worldstate.operations import run_recording
 from worldstate.operations.calibration.cueing_calibration import hop_streams, read_input
 from worldstate.operations.corpus.approach_meter import LEFT_OUT, ApproachMeter
-from worldstate.operations.corpus.cascade import AFTER_S, BEFORE_S, SAMPLED, kept_seconds
 from worldstate.operations.corpus.corpus_inputs import CorpusInput, find_corpus
+from worldstate.operations.corpus.corpus_run import AFTER_S, BEFORE_S, SAMPLED, kept_seconds
 from worldstate.operations.corpus.corpus_tables import TABLES, StateHours, corpus_rows
 from worldstate.operations.corpus.shadow import hours_to_prove, shadow_hours, write_shadow_page
 from worldstate.operations.metrics.approach_table import rising_edges

@@ -36,7 +36,7 @@ class CorpusInput:
 
     @property
     def key(self) -> str:
-        """Digest of the name, with which the names of its files start."""
+        """Digest of the name; the names of its files start with it."""
         return hashlib.sha256(self.name.encode()).hexdigest()[:16]
 
     def digest(self) -> str:

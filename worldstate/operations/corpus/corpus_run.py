@@ -13,6 +13,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from worldstate.abduction.sequence.sequence_inputs import SIDES
+from worldstate.adapters.audio.sound_file import open_sound
 from worldstate.adapters.files.array_file import file_of_model
 from worldstate.adapters.files.file_io import read_json, write_json
 from worldstate.adapters.files.model_file import Model, read_model
@@ -21,14 +22,16 @@ from worldstate.adapters.source import Source, SourceParts, SourceSensors, open_
 from worldstate.adapters.state_log import PARQUET, is_own_mcap, read_log
 from worldstate.belief.street_model import StreetModel
 from worldstate.frontend.array.microphone_array import MicrophoneArray
-from worldstate.ground import InputFileError, InvalidArgumentError, MissingExtraError, WorldstateError
+from worldstate.frontend.array.steering import cross_spectra
+from worldstate.frontend.spectra.stft import StreamingStft, band_bins
+from worldstate.ground import TINY, InputFileError, InvalidArgumentError, MissingExtraError, WorldstateError
 from worldstate.ground.extras import check_extra
 from worldstate.ground.parallel import in_executor, in_processes
+from worldstate.ground.typing import BoolArray, FloatArray
 from worldstate.ground.version import __version__
 from worldstate.operations.recordings.hop_table import HOP_S, STREAM_COLUMNS, hop_stream, signature_checksum
 
 from .approach_meter import ApproachMeter, alarm_level
-from .cascade import SAMPLED, kept_seconds
 from .corpus_inputs import CARD_NAME, LOG_SUFFIX, CorpusInput, file_digest, find_corpus, share_of
 from .corpus_tables import TABLES, HeardApproach, HeardHop, HeardRecording, StateHours, write_table
 
@@ -279,3 +282,45 @@ def _source(plan: HearPlan, one: CorpusInput) -> Source:
 @cache
 def _model(path: Path) -> Model:
     return read_model(path)
+
+
+# Measured on ten simulated minutes of a calm street (SB1, seed 5) and ten of a town (TA1, seed 6), with seven
+# microphones: these values keep 27 % and 56 % of the seconds, 7 of 7 and 25 of 25 onsets, and the 2 s before
+# T0 of 9 of 9 and 32 of 36 vehicles. 2 dB and 0.05 keep 46 % and 68 % of the seconds, the same onsets, and 9
+# and 34 vehicles.
+LOUDER_DB, MORE_COHERENT, USUAL = 3.0, 0.08, 20.0  # The last is a percentile of the seconds
+BEFORE_S, AFTER_S = 3, 2  # A sequence uses 3 s
+_MICROPHONES, _BAND_HZ = 4, (150.0, 1500.0)
+_FRAME_S = 0.04
+# One recording in this many is processed fully, to measure which of its approaches the cascade keeps.
+SAMPLED = 20
+
+
+def kept_seconds(source: Source) -> BoolArray:
+    """Return which seconds of a recording a cascade selects, from four of its microphones, shape (n,).
+
+    These are the seconds whose level or coherence exceeds the recording's usual value, the seconds before
+    them, which the sequence needs, and those after them.
+    """
+    told, n_microphones = [], source.array.n_microphones
+    with open_sound(source.sound, n_microphones, channels=source.array.channels, strict=False) as audio:
+        rate_hz = audio.sample_rate_hz
+        nfft = 1 << round(np.log2(_FRAME_S * rate_hz))
+        chosen = np.unique(np.linspace(0, audio.channels - 1, _MICROPHONES).round().astype(int))
+        stft = StreamingStft(len(chosen), nfft, band_bins(_BAND_HZ, rate_hz, nfft))
+        for block in audio.blocks(rate_hz):
+            told.append(_level_and_coherence(stft.push(np.ascontiguousarray(block[:, chosen]))))
+    marks = np.array(told)
+    above = marks - np.percentile(marks, USUAL, axis=0) > (LOUDER_DB, MORE_COHERENT)
+    return np.convolve(above.any(axis=1), np.ones(BEFORE_S + AFTER_S + 1))[BEFORE_S:][: len(marks)] > 0.0
+
+
+def _level_and_coherence(frames: np.ndarray) -> FloatArray:
+    r"""Return the level in dB and the mean over bins and pairs of :math:`|S_{mn}| / \sqrt{S_{mm} S_{nn}}`."""
+    if not len(frames):  # The last block may be shorter than a frame
+        return np.zeros(2)
+    cross = np.abs(cross_spectra(frames.transpose(1, 0, 2)))
+    powers = np.diagonal(cross, axis1=1, axis2=2)
+    first, second = np.triu_indices(frames.shape[2], 1)
+    coherence = cross[:, first, second] / np.sqrt(powers[:, first] * powers[:, second] + TINY**2)
+    return np.array([10.0 * np.log10(powers.mean() / len(frames) + TINY), coherence.mean()])
