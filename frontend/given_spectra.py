@@ -110,7 +110,7 @@ class SpectrumFrontEnd:
         self.sample_rate_hz = in_range("sample_rate_hz", sample_rate_hz, 1.0, 1e7)
         self._start_ns, self._used = start_ns, 0
         with one_blas_thread():
-            # As `FrontEnd` computes it for this array.
+            # `FrontEnd` computes the same value for this array.
             bins = band_bins(settings.srp_band_hz, sample_rate_hz, settings.nfft)
             hz = bin_frequencies_hz(bins, sample_rate_hz, settings.nfft)
             beams = [Steering.towards(spectra.array, hz, spectra.azimuths_rad)]

@@ -78,7 +78,7 @@ class AcousticFrame:
     heard : float or None
         Usable share of the latest hop or of the window, whichever is smaller; 0 if less than 0.4 of the
         window is usable. Hops with a usable share below 0.2 are excluded from all results. None for given
-        spectra, for which it is not measured.
+        spectra, because it is then not measured.
     unheard : str or None
         Reason why the rest is not usable: "lost samples", "wind", "noise far above this place's usual", "no
         sound common to the microphones" or "sound that contradicts the positions of the microphones".

@@ -3,7 +3,7 @@ r"""Radial speed from the Doppler shift of an engine line, if it is identifiable
 .. math:: f_r = f_0 / (1 + v_r / c), \qquad v_r > 0 \text{ receding},
 
 on the receiver's clock, with v_r at the time of emission. The rest frequency f_0 of an unknown vehicle is
-unknown, and the speed of its engine varies, so a change of the line alone is no evidence of motion. It is
+unknown, and the speed of its engine varies, so a change of the line alone does not show motion. It is
 interpreted as Doppler shift only if, within the measured variance, the S-curve of a straight pass-by explains
 it better than a constant line or a smoothly drifting engine. In addition, the harmonics must agree and the
 level must follow the range of this pass-by. Otherwise the result is `NotUsable`.

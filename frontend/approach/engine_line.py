@@ -61,7 +61,7 @@ def best_path(ratio: FloatArray, bin_hz: float) -> FloatArray:
 
     .. math:: Q_k(f) = \sum_h \big[\ln(1 + P_k(h f) / \nu_k(h f)) - q\big],
 
-    where the price q per partial lowers the score of f / 2, half of whose partials are empty. The rate of
+    where the price q per partial lowers the score of f / 2: half of its partials are empty. The rate of
     change along the track is limited.
 
     Source: A. M. Noll, "Pitch determination of human speech by the harmonic product spectrum, the harmonic

@@ -321,7 +321,7 @@ class _Spectrum:
         self._band = slice(int(np.ceil(low / self._step)), int(high / self._step) + 1)
 
     def offset(self, sound: FloatArray) -> float:
-        """Return the mean under the window, to which a tone of a few periods does not contribute."""
+        """Return the mean under the window; a tone of a few periods does not contribute to it."""
         return float(self._window @ sound) / float(self._window.sum())
 
     def power(self, sound: FloatArray) -> FloatArray:

@@ -377,7 +377,7 @@ def _width(side: FloatArray) -> int:
 # dB above the ambience, have 0.48 (4 microphones) to 0.67 (56) in nine of ten hops. Real windows of hidden
 # vehicles are below 0.25.
 _MIDDLE, _WIDTH = 0.4, 0.03
-# Height of a second peak above the median, relative to the first, from which there are two sources.
+# Smallest height of a second peak above the median, relative to the first, that shows two sources.
 _SECOND = 0.6
 
 

@@ -121,7 +121,7 @@ class ChannelLevels:
         if True in good:
             level = 10.0 * np.log10(np.maximum(powers, _TINY))
             level -= median(level[:, good])[:, None]
-            # A hop in which a channel fails gives no information about its level.
+            # If a channel fails in a hop, the hop does not show its level.
             self._latest = np.where(good, mean(level, 0), self._latest)
         self._hops.append(self._latest)
         self._count += good

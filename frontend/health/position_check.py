@@ -30,7 +30,7 @@ from worldstate.ground.values import wrap_angle
 
 from .geometry_check import PlaneWaves, diffuse_coherence
 
-# Duration of a frame, and of a part in which one source dominates: a syllable of speech.
+# Duration of a frame, and of a part: a syllable of speech, while one source dominates.
 _FRAME_S, _PART_S = 0.032, 0.25
 # Most channels for which every exchange of two is tested; a single test with 56 channels takes 0.5 s.
 FEW = 16
@@ -55,7 +55,7 @@ _RIGHT = (1.0, 0.92, 1.09)
 _OFF = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0, 10.0, 25.4, 39.37, 1 / 10, 1 / 25.4, 1 / 39.37)
 # Smallest gain of another order and of another size in the logarithm of the unexplained part, and in standard
 # deviations. In simulated rooms, right orders lose at least 0.5 by a change. Right sizes lose at least 0.09
-# (rings of 4) or 0.01 (56 microphones, of which one direction explains a tenth). Wrong sizes gain at least
+# (rings of 4) or 0.01 (56 microphones; one direction explains a tenth). Wrong sizes gain at least
 # 0.02.
 _ORDER_GAIN, SIZE_GAIN, _SIGMAS = 0.05, 0.015, 4.0
 # Mean square of the coherence below which the microphones have no common sound.
@@ -257,7 +257,7 @@ class Comparison:
 
     @property
     def _is_one_wave(self) -> bool:
-        """Whether an array in a vertical plane receives one wave, for which size and angle are equivalent."""
+        """Whether an array in a vertical plane receives one wave: size and angle are then equivalent."""
         extent_m = float(np.abs(self._positions).max())
         if np.linalg.matrix_rank(self._positions[:, :2], tol=_SAME_PLACE * extent_m) > 1:
             return False

@@ -267,7 +267,7 @@ def test_masked_hops_are_left_out_of_the_window(first: int, length: int, same: b
 
 @pytest.mark.parametrize("azimuth_deg", [60.0, 85.0, 90.0, 95.0])
 def test_an_all_round_search_treats_all_directions_alike(azimuth_deg: float) -> None:
-    """Oracle: the array turned by a right angle is the array, with its channels in another order."""
+    """Oracle: turned by a right angle, the array is the same with its channels in another order."""
     all_round = FrontEndSettings(azimuth_span_deg=(-180.0, 180.0))
     beside = noise_from(SQUARE, np.radians(azimuth_deg), RATE, 1.0)
     behind = beside[:, [1, 2, 3, 0]]

@@ -351,7 +351,7 @@ def test_shadow_hours_are_those_of_completed_recordings(corpus, heard, street, t
     out = tmp_path / "out"
     shutil.copytree(heard, out)
     words = words_of(corpus, street, out)
-    # As after a kill: there are tables without the row of the recording.
+    # A kill leaves tables without the row of the recording.
     killed = next(iter((out / "recordings").glob("*.parquet")))
     (out / "hours" / killed.name).with_stem("f" * 16 + "-left").write_bytes(b"")
     assert main([*words, "--shadow", "--json"]) == 0
@@ -425,7 +425,7 @@ def test_tables_are_equal_after_ten_kills(corpus, street, heard, tmp_path):
         jobs = ["--jobs", "2"] if kill in (4, 7) else []
         with subprocess.Popen([sys.executable, "-m", "worldstate", *words, *jobs]) as run:
             deadline = time.monotonic() + 60.0
-            # Later with each kill: before the first file, between files, within one.
+            # Each kill comes later: before the first file, between files, within one.
             while run.poll() is None and time.monotonic() < deadline:
                 if len([*tmp_path.glob("*/*.parquet")]) >= kill:
                     run.send_signal(signal.SIGKILL if kill % 2 else signal.SIGTERM)

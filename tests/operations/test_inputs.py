@@ -1,4 +1,4 @@
-"""Recordings and arrays of users in bearings, bounds and doctor."""
+"""Recordings and arrays of users in `array bearings`, `array bounds` and `array check`."""
 
 import io
 import json
@@ -206,9 +206,9 @@ def test_channels_of_a_sound_card_are_selected(
     assert written(card, "--array", "respeaker-usb") == expected
     assert written(card, "--array", with_channels(2, 3, 4, 5)) == expected
     assert written(f"pcm:{RATE}:{5 + silent}", "--array", "respeaker-usb") == expected
-    assert written(tmp_path / "chosen.wav", "--array", "respeaker-usb") == expected, "chosen already"
+    assert written(tmp_path / "chosen.wav", "--array", "respeaker-usb") == expected
     turned = written(tmp_path / "chosen.wav", "--array", with_channels(2, 3, 4, 1))
-    assert turned != expected, "an order of the channels that there are is one that was asked for"
+    assert turned != expected
     assert written(card, "--array", with_channels(3, 4, 5, 2)) == turned
     command = ["run", "--uncalibrated"]
     expected = written(tmp_path / "chosen.wav", "--array", str(file))

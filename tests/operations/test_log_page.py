@@ -211,7 +211,7 @@ def test_the_image_of_a_snapshot_is_the_last_one_at_or_before_it(states):
     for early in ([], [0, stamps_ns[0] - 5]):
         data = page_data(states, media=logged_images([*early, *given]))
         assert not data["remarks"]
-        # No other one before the first snapshot or after the last
+        # Only the last image before the first snapshot is kept, and none after the last one.
         assert len(data["images"]) == 4 + bool(early)
         for row, at_ns in zip(data["states"], stamps_ns, strict=True):
             before = [str(one).encode() for one in [*early, *given] if one <= at_ns]
@@ -372,7 +372,7 @@ def test_sound_slider_and_image_are_synchronous(states, log_with_media, tmp_path
             assert of_uri(page.value("document.querySelector('img').src"), "image/jpeg") == JPEGS[at % 2]
         page.value("at('slider').value = 2; at('slider').dispatchEvent(new Event('input'))")
         assert page.value(held) == [pytest.approx(0.2, abs=1e-4), 2]
-        # Slower than the clock, it sets the pace, otherwise it would be paused halfway.
+        # The sound is slower than the clock and sets the pace; otherwise it would be paused halfway.
         page.value("document.querySelector('audio').playbackRate = 0.5")
         space = "document.body.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))"
         page.call("Runtime.evaluate", expression=space, userGesture=True)

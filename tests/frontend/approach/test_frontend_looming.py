@@ -102,7 +102,7 @@ def test_looming_has_a_larger_error_at_the_start_of_a_stream() -> None:
 
 
 def test_bearing_of_a_pass_by() -> None:
-    """Errors against where the source was when what is heard now left it."""
+    """Errors relative to the place of the source at the emission of the sound that arrives now."""
     array, errors = MicrophoneArray(roof_array_56().positions_m[::4]), []
     sound = render(array, pass_by, 2.0, seed=1)
     sound += 0.02 * np.random.default_rng(0).standard_normal(sound.shape)

@@ -1,4 +1,4 @@
-"""Rife-Boorstyn: exact without noise, at the bound with it; and the engine line of a stream."""
+"""Tones: exact without noise, at the bound of Rife and Boorstyn in noise; engine line of a stream."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_noiseless_real_tone_is_exact(frequency, phase, amplitude, n):
 
 
 def test_real_estimate_is_the_least_squares_optimum():
-    """Near 0 Hz the periodogram of a real tone is biased; the likelihood is what must be maximal."""
+    """Near 0 Hz the periodogram of a real tone is biased; the likelihood must be maximal instead."""
     rng = np.random.default_rng(5)
     t = np.arange(128) / SAMPLES_HZ
     y = np.cos(2 * np.pi * 13.0 * t + 1.0) + 0.3 * rng.normal(size=128)
@@ -88,7 +88,7 @@ def test_variance_meets_the_decimated_bound(snr_db: float, low_hz: float, high_h
     rng, trials, eta = np.random.default_rng(int(snr_db) + int(low_hz)), 150, 10 ** (snr_db / 10)
     stage = ToneStage(PAIR, RATE)
     rate = Decimator(RATE, 400.0).rate_hz
-    # White noise whose density makes this eta of the samples that are left: 1 / 2 eta of each.
+    # White noise of a density that gives the decimated samples this eta: 1 / 2 eta per sample.
     noise = np.sqrt(0.5 / eta * RATE / rate)
     errors, claimed = [], []
     for _ in range(trials):

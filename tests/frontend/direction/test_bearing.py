@@ -84,7 +84,7 @@ def test_a_bearing_of_noise_has_a_large_error(kind: str, microphones: int) -> No
     frames = hear(array, diffuse(array, 3, 1) if kind == "diffuse" else white)
     stated = np.degrees([frame.bearing_std_rad for frame in frames])
     assert np.mean(stated < 10.0) <= 0.1
-    # Uniform over the half-plane is 52 degrees; the error of a bearing of noise is 40 and more.
+    # A uniform bearing ahead has a deviation of 52 degrees, and a bearing of noise one of 40 or more.
     assert np.median(stated) > 30.0
 
 

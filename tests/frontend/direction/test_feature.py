@@ -113,7 +113,7 @@ def at_seven(azimuth_rad: float, seed: int) -> np.ndarray:
 
 
 def given(sound: np.ndarray) -> GivenSpectra:
-    """The pair sums of every hop by the plain formula, as of another front-end."""
+    """Return the pair sums of every hop by the plain formula, in place of another front-end."""
     hops = [frames_of(sound[i : i + 4800], padded=True) for i in range(0, len(sound), 4800)]
     sums = plain_feature(hops, SEVEN.positions_m, -LEFT_POSITIVE_RAD, GIVEN_HZ)
     return GivenSpectra(sums.reshape(-1, 180), LEFT_POSITIVE_RAD, SEVEN)

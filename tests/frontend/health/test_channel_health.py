@@ -121,7 +121,7 @@ def test_exactly_the_faults_present_are_found(kind: str, seed: int) -> None:
     ("seed", "levels"), [*((seed, None) for seed in range(100, 104)), *((8, levels) for levels in (2, 5, 30))]
 )
 def test_a_clean_street_raises_no_alarm(seed: int, levels: int | None) -> None:
-    """Coarse quantisation is no clipping."""
+    """Coarse quantisation is not reported as clipping."""
     array = (HALF, ROOF)[seed % 2]
     sound = street(array, seed)
     if levels is not None:
@@ -289,7 +289,7 @@ def test_each_timing_fault_is_found_alone(spoil: Spoil, n_channels: int) -> None
     size = {"level": 6.0, "delayed": 3e-4, "drifting": 5e-5}.get(latest[0].fault.value)
     if size is not None:
         assert latest[0].value == pytest.approx(size, rel=0.25)
-    # The least of the five faults must be known well enough to be believed.
+    # The stated error must be small relative to the value.
     assert latest[0].std is None or latest[0].std < 0.2 * abs(latest[0].value)
 
 

@@ -52,7 +52,7 @@ ARRAYS = {
 
 
 def street(array: MicrophoneArray, spectrum: str, noise_db: float, seed: int = 0) -> np.ndarray:
-    """A wave from the left, and noise of its spectrum that is independent between the microphones."""
+    """Return a wave from the left in noise of the same spectrum, independent between the microphones."""
     rng = np.random.default_rng(seed)
     wave = plane_wave(array, rng.standard_normal(2 * RATE), 0.7, RATE)
     noise = shaped(rng.standard_normal((2 * RATE, array.n_microphones)), spectrum, RATE)
@@ -124,7 +124,7 @@ def far_field(positions_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(6, 9), st.floats(0.1, 0.6))
 def test_waves_fit_the_positions_and_no_other_order(seed: int, n: int, extent_m: float) -> None:
-    """Most other orders of an irregular array exceed 0.4, the misfit from which a hop votes against them.
+    """Most other orders of an irregular array exceed 0.4: a larger misfit is a vote against an order.
 
     Of 400 random arrays and waves the smallest median was 0.55; a search found 0.42 (seed 229325, n = 6).
     """

@@ -26,7 +26,7 @@ def ring(n: int, radius_m: float) -> np.ndarray:
 
 
 def room(positions: np.ndarray, azimuths_deg: tuple[float, ...], seed: int = 0) -> np.ndarray:
-    """Return talkers one after the other, two seconds each, in a room with .4 s of reverberation."""
+    """Return talkers one after the other, two seconds each, in a room with 0.4 s of reverberation."""
     rng = np.random.default_rng(seed)
     absorption, order = pra.inverse_sabine(0.4, [6.0, 5.0, 2.8])
     box = pra.ShoeBox([6.0, 5.0, 2.8], fs=RATE, materials=pra.Material(absorption), max_order=min(order, 25))

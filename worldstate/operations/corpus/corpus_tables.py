@@ -35,7 +35,7 @@ class HeardRecording:
     looked: int = 0  # Hops with a look of a camera
     usable: int = 0  # Hops in which every cue is usable
     onsets: int = 0  # Number of times an advisory of any side began while none was active
-    budget: float | None = None  # Onsets per hour for which the alarm is set; None if not stated
+    budget: float | None = None  # Requested onsets per hour of the alarm; None if not stated
     failure: str | None = None  # Reason for the failure
 
 

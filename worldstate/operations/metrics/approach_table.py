@@ -104,7 +104,7 @@ class StreamApproach:
     entries_s: tuple[float, ...] = ()
     sides: tuple[int, ...] = ()
     kinds: tuple[str, ...] = ()
-    quiet: bool = False  # Whether any of them is a quiet road user, for which no target is set
+    quiet: bool = False  # Whether any of them is a quiet road user; no target is set for these
 
 
 @dataclass(frozen=True, slots=True)

@@ -152,7 +152,7 @@ class RecordingReport:
         Whether the cues met a false-alarm budget, in how many hops they were usable, and without a model the
         number of tracked sounds.
     end : Checkpoint or None
-        Belief and site after the last hop, from which processing can continue; None without one.
+        Belief and site after the last hop, to continue from; None without one.
 
     Examples
     --------
