@@ -11,15 +11,12 @@ from worldstate.operations.metrics.approach_table import onset_outcome, rising_e
 from worldstate.operations.recordings.hop_table import HopTable
 from worldstate.operations.recordings.recording_report import WarningMeter, announcement
 from worldstate.state import Advisory, Context, Entity, RiskCue, WorldState
-from worldstate.state.context import Priors
-
-HYPOTHESES = Priors(0.5, 0.2, 0.3)
 
 
 def state(time_s: float, since_s: float | None, entity_id: str = "a", *entities: Entity) -> WorldState:
     told = None if since_s is None else Advisory(nanoseconds(since_s), nanoseconds(since_s + 1.0))
-    cue = RiskCue("left", 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, HYPOTHESES, told, entity_id=entity_id)
-    return WorldState(nanoseconds(time_s), 0, entities=entities, relations=(), context=Context(), cues=(cue,))
+    cue = RiskCue("left", 0.9, 0.3, 0.5, 0.9, 0.9, 1.0, None, told, entity_id=entity_id)
+    return WorldState(nanoseconds(time_s), 0, entities=entities, context=Context(), cues=(cue,))
 
 
 def summary(t0_s: float | None, onsets: dict[float, str], *entities: Entity, hazard_free: bool = False):
