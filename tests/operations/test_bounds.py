@@ -54,7 +54,7 @@ def test_information_of_bins_adds_and_a_random_signal_costs():
 
 @settings(max_examples=30, deadline=None)
 @given(azimuth=st.floats(-np.pi, np.pi))
-def test_endfire_corollary(azimuth):
+def test_information_falls_towards_endfire_as_in_the_corollary(azimuth):
     positions = roof_array_56().positions_m
     share = endfire_information(positions, azimuth)
     assert share == pytest.approx(np.cos(azimuth) ** 2, abs=1e-12)

@@ -265,7 +265,7 @@ def test_the_threshold_command_reads_a_sound_file(tmp_path, capsys):
 
 @given(st.floats(0.0, 0.9))
 @settings(deadline=None, max_examples=15)
-def test_correlation_time_of_an_autoregression(phi):
+def test_the_correlation_time_of_an_autoregression_is_found(phi):
     """Stationary Gaussian AR(1) rows of unit variance."""
     rng = np.random.default_rng(1)
     shocks = rng.normal(size=(30, 4000)) * math.sqrt(1.0 - phi**2)

@@ -122,9 +122,7 @@ def test_integer_samples_are_scaled_to_full_scale() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["s16", "s24", "s32", "f32"])
-def test_raw_samples_on_standard_input(
-    encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_raw_samples_on_standard_input_equal_those_of_a_file(encoding, tmp_path, monkeypatch, capsys):
     sound, raw, out = wave(MicrophoneArray(ring(4, 0.2)), 20.0), io.BytesIO(), tmp_path / "b.csv"
     file = write_array(tmp_path / "m.csv", ring(4, 0.2))
     subtype = {"s16": "PCM_16", "s24": "PCM_24", "s32": "PCM_32", "f32": "FLOAT"}[encoding]
@@ -152,7 +150,7 @@ def test_bad_samples_on_a_pipe_raise_an_error(n_bytes: int, problem: str) -> Non
         open_sound(RawPcm(io.BytesIO(bytes(n_bytes - n_bytes % 4)), RATE, 2), 3)
 
 
-def test_one_file_per_microphone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_file_per_microphone_equals_one_file_of_all(tmp_path, capsys):
     sound = wave(MicrophoneArray(ring(4, 0.2)), 20.0)
     names = [tmp_path / f"mic{i}.wav" for i in range(4)]
     for name, channel in zip(names, sound.T, strict=True):
@@ -179,9 +177,7 @@ def recorded_by_card(path: Path, sound: np.ndarray, silent: int) -> Path:
 
 
 @pytest.mark.parametrize("silent", [1, 12])
-def test_channels_of_a_sound_card_are_selected(
-    silent: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_channels_of_a_sound_card_are_selected(silent, tmp_path, monkeypatch):
     array, out = read_array("respeaker-usb"), tmp_path / "b.csv"
     sound = wave(array, 20.0)
     soundfile.write(tmp_path / "chosen.wav", sound, RATE)
@@ -226,9 +222,7 @@ def test_channels_of_a_sound_card_are_selected(
         ([], "card.wav: expected 4 channels, one per microphone, got 6; .channels. in the JSON file"),
     ],
 )
-def test_wrong_channels_raise_an_error(
-    channels: list[int], problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_channels_raise_an_error(channels, problem, tmp_path, capsys):
     file = tmp_path / "m.json"
     file.write_text(json.dumps({"positions_m": ring(4, 0.2)} | ({"channels": channels} if channels else {})))
     card = recorded_by_card(tmp_path / "card.wav", wave(MicrophoneArray(ring(4, 0.2)), 20.0), 1)

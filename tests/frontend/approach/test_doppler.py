@@ -49,7 +49,7 @@ def speed_of(sound, **options):
 
 
 @pytest.mark.parametrize(("speed", "distance"), [(8.3, 4.0), (13.9, 8.0)])
-def test_radial_speed_of_a_pass_by_rendered_by_acoular(speed, distance):
+def test_the_radial_speed_of_a_pass_by_rendered_by_acoular_is_found(speed, distance):
     path = straight(speed, distance, 2.6)
     found = speed_of(pass_by(engine(47.0, 5.2), path))
     truth = emission_truth(found.time_s, speed, path)

@@ -101,7 +101,7 @@ def test_looming_has_a_larger_error_at_the_start_of_a_stream() -> None:
     assert abs(cold.inverse_tta_hz - 0.5) < 2.0 * cold.std_hz
 
 
-def test_bearing_of_a_pass_by() -> None:
+def test_the_bearing_of_a_pass_by_is_accurate() -> None:
     """Errors relative to the place of the source at the emission of the sound that arrives now."""
     array, errors = MicrophoneArray(roof_array_56().positions_m[::4]), []
     sound = render(array, pass_by, 2.0, seed=1)
@@ -116,7 +116,7 @@ def test_bearing_of_a_pass_by() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_looming_of_a_direct_approach(seed: int) -> None:
+def test_the_looming_of_a_direct_approach_is_accurate(seed: int) -> None:
     """Errors of TTA on the receiver's clock, and those of 1/TTA in reported standard errors."""
     array, errors, scores = MicrophoneArray(roof_array_56().positions_m[::20]), [], []
     for frame in FrontEnd(array, RATE).process(render(array, direct, 3.0, seed)):

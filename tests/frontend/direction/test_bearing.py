@@ -25,7 +25,7 @@ BAND = (300.0, 1800.0)
 
 @pytest.mark.parametrize("rate", [47_998.0, 16_000.0])
 @pytest.mark.parametrize("layout", ["roof", "square", "line", "solid"])
-def test_equals_pyroomacoustics_on_the_same_frames(layout: str, rate: float) -> None:
+def test_srp_phat_equals_pyroomacoustics_on_the_same_frames(layout: str, rate: float) -> None:
     layouts = {
         "roof": roof_array_56().positions_m,
         "square": [[0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0], [-0.1, 0.1, 0]],
@@ -188,7 +188,7 @@ def test_music_equals_pyroomacoustics(frames, sources):
     ("microphones", "frames", "truths", "azimuths_deg"),
     [*((12, 100, [truth] * 40, (-50, 10, 45)) for truth in range(4)), (56, 19, [0, 1, 2] * 10, (-40, 30))],
 )
-def test_number_of_sources(microphones, frames, truths, azimuths_deg):
+def test_the_number_of_sources_is_found(microphones, frames, truths, azimuths_deg):
     """Also with fewer frames than microphones."""
     rng = np.random.default_rng(truths[-1])
     array, hits = plate(microphones, rng), 0

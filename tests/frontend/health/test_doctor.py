@@ -78,7 +78,7 @@ def test_a_recording_is_healthy_unless_its_sample_rate_is_wrong(street, tmp_path
     assert "the header is wrong" in capsys.readouterr().out
 
 
-def test_bad_input(street, tmp_path, capsys):
+def test_bad_input_gives_one_line(street, tmp_path, capsys):
     assert main(["array", "check", "nothing.wav"]) == 2
     assert "nothing.wav: no such file" in capsys.readouterr().err
     assert array_check(tmp_path, ROOF, street[:, :55], RATE) == 2

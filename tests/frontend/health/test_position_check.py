@@ -94,7 +94,7 @@ def checked(folder: Path, sound: np.ndarray, positions: np.ndarray, *options: st
     return array_check(folder, MicrophoneArray(positions), sound, RATE, *options)
 
 
-def test_the_command(talkers: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reports_an_exchange_and_clipping(talkers, tmp_path, capsys):
     assert checked(tmp_path, talkers, ring(6, 0.045)) == 0
     assert "mirrored or rotated" in capsys.readouterr().out
     assert checked(tmp_path, talkers, ring(6, 0.045)[[1, 0, 2, 3, 4, 5]], "--json") == 1
