@@ -29,15 +29,12 @@ RIGHT_POSITIVE_RAD = np.radians(np.linspace(-90.0, 90.0, 30))
 
 
 def plain_feature(
-    segments: Iterable[np.ndarray],
-    positions_m: np.ndarray,
-    right_positive_rad: np.ndarray = RIGHT_POSITIVE_RAD,
-    rate: float = RATE,
+    segments: Iterable[np.ndarray], positions_m: np.ndarray, azimuths_rad=RIGHT_POSITIVE_RAD, rate=RATE
 ) -> np.ndarray:
     """|sum over frames, bins and pairs i < j| over their number, of spectra (257, M, frames) per segment."""
     bins = np.arange(round(50 / rate * 512), round(1500 / rate * 512))
     pairs = len(positions_m) * (len(positions_m) - 1) / 2
-    units = np.stack([np.cos(right_positive_rad), -np.sin(right_positive_rad)])
+    units = np.stack([np.cos(azimuths_rad), -np.sin(azimuths_rad)])
     early_s = positions_m[:, :2] @ units / 343.0
     turn, values = np.exp(2j * np.pi * rate / 512 * bins[:, None, None] * early_s), []
     for spectra in segments:

@@ -20,16 +20,10 @@ from worldstate.operations.recordings.channel_report import ChannelVerdict, Heal
 RATE = 16_000
 ROOF = roof_array_56()
 HALF = MicrophoneArray(ROOF.positions_m[::2])
-SECONDS = 3.5
 
 
 def street(
-    array: MicrophoneArray,
-    seed: int,
-    seconds: float = SECONDS,
-    waves: int = 10,
-    slope: float = 1.0,
-    rate: int = RATE,
+    array: MicrophoneArray, seed: int, seconds: float = 3.5, waves: int = 10, slope: float = 1.0, rate=RATE
 ) -> np.ndarray:
     """Red noise of changing level from many directions, every microphone 0.3 dB and 0.02 ms off, (n, M)."""
     rng, n = np.random.default_rng(seed), round(seconds * rate)
@@ -107,7 +101,7 @@ FAULTS = {
 def test_exactly_the_faults_present_are_found(kind: str, seed: int) -> None:
     expected, masked = FAULTS[kind]
     # It takes six seconds to distinguish a gain from a gust.
-    sound = street(HALF, seed, seconds=6.5 if kind == "gain" else SECONDS)
+    sound = street(HALF, seed, seconds=6.5 if kind == "gain" else 3.5)
     spoil(sound, kind, np.random.default_rng(50 + seed))
     last = healths(HALF, sound)[-1]
     assert named(last.faults) == expected
