@@ -279,7 +279,7 @@ def test_a_foreign_sound_has_no_kind_and_a_siren_its_own() -> None:
 
 
 def test_an_excluded_class_raises_the_miss_rate_or_is_unqueried() -> None:
-    """Earlier images show classes of the detector, and the one now is empty."""
+    """Earlier images show the classes that the detector has; the latest image is empty."""
     car_px, at = (600.0, 300.0, 800.0, 600.0), (200_000_000, Bearing(0.0, 0.05))
     ask, one = (
         partial(watched([boxed(car_px), boxed(car_px, label=other), EMPTY]).ask, *at)

@@ -1,4 +1,4 @@
-"""Sound of any rate from 8 kHz up gives the states of 48 kHz, from files, pipes, bags and microphones."""
+"""Sound of any rate from 8 kHz up gives the states of 48 kHz."""
 
 import io
 from dataclasses import replace

@@ -134,7 +134,7 @@ def test_ambiguous_and_damaged_arrays_are_refused(text: str | bytes, problem: st
     expect(problem, tmp_path / "mics")
 
 
-def test_missing_and_huge_arrays(tmp_path: Path) -> None:
+def test_missing_and_huge_arrays_are_refused(tmp_path: Path) -> None:
     expect("No such file", tmp_path / "no.xml")
     expect("array file", tmp_path)
     (tmp_path / "big.xml").write_bytes(b"<MicArray>" + b" " * (1 << 20) + b"</MicArray>")
@@ -143,7 +143,7 @@ def test_missing_and_huge_arrays(tmp_path: Path) -> None:
 
 @given(data=st.binary(max_size=300))
 @settings(max_examples=60, deadline=None)
-def test_any_bytes_as_an_array(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+def test_random_bytes_are_no_array(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     name = tmp_path_factory.mktemp("xml") / "mics.xml"
     name.write_bytes(data)
     with pytest.raises(InputFileError):
@@ -193,7 +193,7 @@ def test_the_description_shows_an_array_along_the_vehicle() -> None:
     roof = roof_array_56()
     extents = "0.00 m along x (forward), 0.78 m along y (left), 0.65 m along z (up)"
     assert stance(roof) == f"56 microphones, {extents}; front-back ambiguous"
-    # The roof array if base_link axes are written into a file of Acoular's form.
+    # A user wrote base_link axes into a file of Acoular's form.
     sideways = MicrophoneArray(roof.positions_m[:, [2, 0, 1]] * [1.0, -1.0, 1.0])
     assert "no extent across the vehicle" in stance(sideways)
 

@@ -71,7 +71,7 @@ def answers(
 
 
 @pytest.mark.parametrize(("source", "name", "expected"), NAMED)
-def test_names_of_every_data_set(source: str, name: str, expected: str | None) -> None:
+def test_names_of_every_data_set_are_known(source: str, name: str, expected: str | None) -> None:
     joined = "".join(word.capitalize() for word in name.split("_"))
     assert source == "machine ids" or "_" not in name or class_name(joined) == class_name(name)
     unseen = expected in {"bicycle", "person", None}
@@ -152,7 +152,7 @@ def test_an_ignored_box_is_no_miss(score: float, label: str) -> None:
     frames = (*counted.frames[:17], *(joined(one, beside) for one in left.frames[17:]))
     unseen = DetectionLog(frames[:17], counted.stamps_ns[:17])
     seen, alone = (in_view(log, range(12, 22)) for log in (replace(counted, frames=frames), unseen))
-    assert seen[-1][1] == pytest.approx(alone[-1][1])  # Carried as without an image
+    assert seen[-1][1] == pytest.approx(alone[-1][1])  # The belief is predicted as without an image
 
 
 def joined(one: DetectionFrame, other: DetectionFrame) -> DetectionFrame:

@@ -37,21 +37,21 @@ CAMERAS = st.builds(
 
 
 @given(camera=CAMERAS, share=st.floats(0.0, 1.0))
-def test_column_and_back(camera: PinholeCamera, share: float) -> None:
+def test_a_column_has_one_azimuth(camera: PinholeCamera, share: float) -> None:
     azimuth = camera.azimuth(share * camera.width_px)
     assert -math.pi < azimuth <= math.pi
     assert float(camera.column(azimuth)) == pytest.approx(share * camera.width_px, abs=1e-6 * camera.width_px)
 
 
 @given(camera=CAMERAS, inside=st.floats(0.001, 0.999), outside=st.floats(0.01, 0.5))
-def test_sees_between_its_edges(camera: PinholeCamera, inside: float, outside: float) -> None:
+def test_a_camera_sees_between_its_edges(camera: PinholeCamera, inside: float, outside: float) -> None:
     width = camera.width_px
     assert camera.sees(camera.azimuth(inside * width))
     assert not camera.sees(camera.azimuth([-outside * width, (1 + outside) * width])).any()
 
 
 @given(camera=CAMERAS, off_axis=st.floats(-1.2, 1.2))
-def test_agrees_with_opencv(camera: PinholeCamera, off_axis: float) -> None:
+def test_columns_agree_with_opencv(camera: PinholeCamera, off_axis: float) -> None:
     cv2 = pytest.importorskip("cv2")
     centre, bearing = np.array(camera.position_m), camera.yaw_rad + off_axis
     point = centre + camera.nominal_range_m * np.array([math.cos(bearing), math.sin(bearing), 0.0])
@@ -130,7 +130,7 @@ def test_an_unknown_key_is_refused_and_those_about_boxes_are_read(tmp_path):
 
 @pytest.fixture
 def watched(tmp_path):
-    """A recording folder whose video shows a square that crosses from left to right: 2 s at 10 Hz."""
+    """Return a recording folder; its video shows a square that crosses from left to right: 2 s at 10 Hz."""
     folder, rng = tmp_path / "SA1" / "left" / "1_00_0002", np.random.default_rng(0)
     folder.mkdir(parents=True)
     soundfile.write(folder / "out_multi.wav", 0.01 * rng.standard_normal((2 * 48_000, 56)), 48_000)

@@ -329,7 +329,7 @@ def drive() -> str:
     return f'{{"detections_per_frame": [{",".join([frame] * 54_000)}]}}'
 
 
-# Where 4,000,000 values are the limit, the files have almost as many.
+# Files with a limit of 4,000,000 values have almost as many.
 FILES: dict[str, tuple[Callable[[Path], object], Callable[[], str]]] = {
     "lists": (read_any_detections, lambda: repeated("[],", 5_999_992)),
     "keys": (read_any_detections, lambda: json.dumps({f"{i:x}": i + 300 for i in range(1_900_000)})),

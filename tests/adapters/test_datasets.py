@@ -202,7 +202,7 @@ def test_short_rows_missing_columns_and_empty_files_are_refused(tmp_path):
             read_features(tmp_path / f"{name}.csv")
 
 
-def test_lists_of_ids(tmp_path):
+def test_lists_of_ids_are_read_or_refused(tmp_path):
     listed = write_csv(tmp_path / "ids.csv", [["1_00_0002"], [" 1_00_0003 "]], ["ID"])
     assert read_ids(listed) == {"1_00_0002", "1_00_0003"}
     for rows, header, said in (([], "ID", "at least one ID"), ([["1"]], "Name", "ID")):

@@ -183,7 +183,7 @@ def test_text_of_a_tracker_is_read_frame_by_frame(tracks, looks, tmp_path_factor
     named = sorted({number - 1 for number, _ in tracks})
     step = math.gcd(*np.diff(named).tolist()) if len(named) > 2 else 1
     seen = read_any_detections(path, 10.0).stamps_ns // 10**8
-    # Numbers that rise by more than one are those of every so many-th image.
+    # If the numbers rise by more than one, only every n-th image is listed.
     assert seen.tolist() == [*range(named[0] % step if named else 0, told, step)]
     if step > 1:
         with pytest.raises(InputFileError, match=rf"rise by {step}.*image_rate_hz"):

@@ -79,7 +79,7 @@ def test_light_is_no_object_however_much_of_the_image_it_changes(background, mon
 
 
 @pytest.mark.parametrize("sigma_px", [0.5, 2.0, 4.0, 8.0, 16.0])
-def test_an_edge_counts_up_to_the_blur_that_its_formula_says(sigma_px):
+def test_an_edge_counts_up_to_the_blur_of_its_formula(sigma_px):
     """A step smeared by sigma rises by C / (sigma sqrt(2 pi)) a pixel."""
     step, region = np.zeros((300, 400), np.float32), np.zeros((300, 400), dtype=bool)
     step[80:220, 100:300], region[80:220, 100:300] = 80.0, True
@@ -110,7 +110,7 @@ def test_a_model_file_is_run_and_its_boxes_are_those_of_the_frame(form, tmp_path
 
 
 class Spy:
-    """A session that keeps what it was given."""
+    """A session that keeps its input."""
 
     def __init__(self, shape=(1, 3, 32, 64), output=FORMS["objectness"]):
         self._shape, self._output, self.fed = shape, output, None
@@ -123,7 +123,7 @@ class Spy:
         return [self._output]
 
 
-def test_the_model_is_given_red_first_in_0_to_1_with_its_proportions_kept():
+def test_the_input_of_a_model_is_red_first_from_0_to_1_with_its_proportions_kept():
     spy = Spy()
     frame = np.zeros((10, 40, 3), dtype=np.uint8)
     frame[:, :, 2] = 255

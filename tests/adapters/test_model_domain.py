@@ -231,7 +231,7 @@ def test_a_drive_above_the_learned_speed_warns_once(alone: Path, caplog: pytest.
 
 
 @pytest.mark.parametrize(("moves", "motion"), [(False, "standing"), (True, "moving")])
-def test_a_model_of_simulated_streets_is_of_the_ego_in_them(moves: bool, motion: str) -> None:
+def test_a_model_of_simulated_streets_has_the_ego_motion_in_them(moves: bool, motion: str) -> None:
     """Junctions of the three renderers have names S.., T.. and M..; the ego motion is the same in all."""
     plan = learned_streams(CommissionSettings(junctions=2, moving_ego=moves))
     assert domain_of(ovad_array(), [6000.0], [one.site.name for one in plan]).ego_motion == motion
@@ -261,7 +261,7 @@ def test_permuted_channels_give_the_model_the_same_feature() -> None:
     np.testing.assert_allclose(found.feature, there.feature, rtol=2e-4)
     free = AcousticAdapter(MicrophoneArray(HERE[order]), RATE, model, uncalibrated=True)
     (unordered,) = free.front_end.process(sound[:, order])
-    assert abs(unordered.feature / there.feature - 1.0).max() > 0.005  # the feature knows the order
+    assert abs(unordered.feature / there.feature - 1.0).max() > 0.005  # The feature depends on the order
 
 
 def test_another_channel_order_is_logged_and_gives_the_same_bearings(tmp_path, approach, caplog) -> None:
@@ -313,7 +313,7 @@ def test_a_table_and_its_model_keep_their_array(tmp_path: Path, capsys: pytest.C
     assert main(train) == 0
     domain = read_model(tmp_path / "m.json").domain
     assert domain is not None and (len(domain.positions_m), domain.ego_motion) == (8, "standing")
-    write_features(tmp_path / "t.csv", windows())  # the companion of another table goes
+    write_features(tmp_path / "t.csv", windows())  # The array of the other table is removed
     assert read_features(tmp_path / "t.csv").domain is None
     capsys.readouterr()
     assert main(train) == 0

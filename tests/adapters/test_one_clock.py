@@ -278,9 +278,9 @@ def test_an_unreadable_early_look_is_counted_alone() -> None:
         (3.0, Odometry("wheels", 0, 1.0), 200, 100),
         (3.0, boxes(0), 200, 100),
         (3.0, boxes(1), 200, 100),
-        (3.0, boxes(100_000), 50, 31),  # 3.5 MB each of 64 MiB
+        (3.0, boxes(100_000), 50, 31),  # Each has 3.5 MB, and 64 MiB are the limit
         (3.0, replace(boxes(1), labels=("x" * 1_000_000,)), 100, 33),
-        (1.0, boxes(100_000), 50, 0),  # of near ones those of a second are kept, with 64 boxes
+        (1.0, boxes(100_000), 50, 0),  # Near images are kept for a second, with 64 boxes each
     ],
 )
 def test_waiting_looks_and_odometry_are_bounded(at_s, told, tries, refused, monkeypatch) -> None:

@@ -209,8 +209,7 @@ def nanodet():
 
 
 class OneCar:
-    """A session with one car in every crop: in cell (5, 3) of stride 16, its sides 2, 0.5, 1 and 3 bins
-    away."""
+    """A session with a car in every crop: cell (5, 3) of stride 16, sides 2, 0.5, 1 and 3 bins away."""
 
     def get_inputs(self):
         return [SimpleNamespace(name="image")]
@@ -248,7 +247,7 @@ def test_a_model_that_is_not_there_is_named(nanodet, tmp_path):
     reason="no ovad-sequences, neither where OVAD_SEQUENCES points nor in ../shared",
 )
 def test_boxes_are_those_that_come_with_the_recordings(nanodet, monkeypatch):
-    # As `worldstate run --detector nanodet` opens it.
+    # `worldstate run --detector nanodet` opens it like this.
     monkeypatch.setenv("NANODET_ONNX", str(RECORDINGS / "detector" / "nanodet_m.onnx"))
     detector = OwnDetector.of("nanodet", nanodet.open_nanodet)
     given = json.loads((RECORDINGS / "boxes" / "1_04_0018.json").read_text())["frames"]

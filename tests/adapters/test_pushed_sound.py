@@ -22,7 +22,7 @@ CAR, TRUCK = (boxed((300, 200, 380, 260), label=label) for label in ("car", "tru
 
 
 def pushed(listener: Listener, start: int, end: int) -> list[str]:
-    """Push samples and their images, of which the one at 0.5 s shows a truck; the last ones end the sound."""
+    """Push samples and their images; the image at 0.5 s shows a truck, and the last samples end the sound."""
     for number in range(30):
         if start <= number * RATE_HZ // 10 < end:
             listener.look(nanoseconds(number / 10), TRUCK if number == 5 else CAR)
@@ -43,8 +43,8 @@ def test_another_listener_continues_at_any_sample_bit_for_bit(cut, in_one) -> No
     first = Listener(THREE, RATE_HZ, model=MODEL, camera=PinholeCamera.ovad())
     states = pushed(first, 0, cut)
     kept = first.checkpoint()
-    first.push(SOUND[cut:])  # a checkpoint stays what it was
-    for _ in range(2):  # and is gone on from more than once
+    first.push(SOUND[cut:])  # The checkpoint must not change
+    for _ in range(2):  # Two listeners continue from it
         second = Listener(THREE, RATE_HZ, model=MODEL, camera=PinholeCamera.ovad(), resume=kept)
         assert states + pushed(second, cut, len(SOUND)) == in_one
 

@@ -102,7 +102,9 @@ def test_outside_of_its_domain_a_sequence_has_a_reason(folder: Path) -> None:
     contexts = Context(), Context(ego_speed_mps=5.0)
     stands, moves = (next(steps(folder, driven, context=one)).state for one in contexts)
     assert stands.no_sequence == NotUsable("the model was made for a moving ego, this one is standing")
-    assert moves.no_sequence is not None and "made for" not in moves.no_sequence.reason  # too short as yet
+    assert (
+        moves.no_sequence is not None and "made for" not in moves.no_sequence.reason
+    )  # The sound is too short so far
     other = replace(THREE, positions_m=1.1 * THREE.positions_m)
     free = next(steps(folder, array=other, settings=ListenSettings(uncalibrated=True))).state
     assert free.no_sequence is not None and free.no_sequence.reason.startswith("uncalibrated")

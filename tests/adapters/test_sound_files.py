@@ -112,7 +112,7 @@ def test_missing_lossy_short_and_empty_sound_and_other_channels_are_refused(tmp_
 
 @pytest.mark.parametrize("container", ["WAV", "WAVEX", "RF64", "W64", "FLAC"])
 @pytest.mark.parametrize("kept", [0.999, 0.9, 0.5])
-def test_truncated_sound(tmp_path: Path, container: str, kept: float) -> None:
+def test_truncated_sound_is_refused(tmp_path: Path, container: str, kept: float) -> None:
     name = write(tmp_path / "cut", noise(12_000), container)
     name.write_bytes(name.read_bytes()[: int(kept * name.stat().st_size)])
     refused("cut short", name)
@@ -137,7 +137,7 @@ def test_a_cut_header_is_refused_and_a_damaged_one_read_or_refused(
         assert str(name) in str(error)
 
 
-def test_silent_channels(tmp_path: Path) -> None:
+def test_silent_channels_are_refused(tmp_path: Path) -> None:
     samples = noise(12_000, 4)
     samples[:RATE_HZ, [0, 2]] = [0.0, 0.25]
     refused("on channel 1, 3$", write(tmp_path / "a.wav", samples))
@@ -147,7 +147,7 @@ def test_silent_channels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_samples_that_are_no_numbers(tmp_path: Path, value: float) -> None:
+def test_samples_that_are_no_numbers_are_refused(tmp_path: Path, value: float) -> None:
     for sample, encoding, read in ((50, "FLOAT", open_audio), (9000, "DOUBLE", heard)):
         samples = noise(12_000, 4).astype(float)
         samples[sample, 1] = value
@@ -313,7 +313,7 @@ def test_sound_of_one_encoding_is_refused_as_another(encoding, read_as, scale, c
     if encoding == read_as:
         with open_sound(raw, strict=False):
             return
-    if (encoding, read_as) == ("s24_32", "s32"):  # the same but for a factor, which draws a line
+    if (encoding, read_as) == ("s24_32", "s32"):  # Only a factor differs, and a warning is logged
         return
     with pytest.raises(InputFileError, match="expected"):
         open_sound(raw)

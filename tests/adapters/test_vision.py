@@ -116,7 +116,7 @@ def test_the_overlap_is_the_intersection_of_sectors(a, b, half_a, half_b, at) ->
 
 
 @given(right=AZIMUTHS, width=st.floats(0.01, 6.2))
-def test_a_sector_between_two_edges(right: float, width: float) -> None:
+def test_a_sector_between_two_edges_has_their_width(right: float, width: float) -> None:
     sector = Sector.between(right, wrap_angle(right + width))
     assert sector.half_width_rad == pytest.approx(width / 2)
     assert abs(wrap_angle(sector.centre_rad - right - width / 2)) < 1e-9
@@ -194,7 +194,7 @@ def test_a_camera_without_an_image_does_not_block_others() -> None:
 # The choice of boxes and images: the filter of the authors, the latest image, parked cars.
 
 
-def test_the_authors_filter() -> None:
+def test_the_filter_is_that_of_the_authors() -> None:
     frame = boxed(*([0, 0, 50, height] for height in (101, 100, 200, 200, 200)))
     labels, scores = ("car", "car", "motorcycle", "truck", "car"), np.array([0.75, 0.9, 0.8, 0.99, 0.74])
     frame = replace(frame, labels=labels, scores=scores)
