@@ -95,3 +95,14 @@ def test_samples_of_another_shape_are_refused_and_nothing_is_lost() -> None:
         with pytest.raises(InvalidArgumentError, match="block"):
             listener.push(wrong)
     assert listener.push(SOUND) == other.push(SOUND)
+
+
+def test_a_site_is_learned_with_a_forgetting_time_or_not_at_all() -> None:
+    def heard_s(**how: float) -> float | None:
+        listener = Listener(THREE, RATE_HZ, model=MODEL, settings=ListenSettings(**how))
+        listener.push(SOUND)
+        site = listener.checkpoint().site
+        return None if site is None else site.heard_s
+
+    assert heard_s(site_adaptation=False) is None
+    assert heard_s(forgetting_s=0.2) <= 0.3 < 1.5 < heard_s()
