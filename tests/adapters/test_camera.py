@@ -115,6 +115,8 @@ def test_an_axis_beside_the_middle_and_a_turned_camera(tmp_path):
     assert math.degrees(camera.azimuth(0.0)) == pytest.approx(30.0 + math.degrees(math.atan(0.8)))
     np.testing.assert_allclose(camera.column(camera.azimuth(columns)), columns, atol=1e-6)
     assert camera.sees(camera.azimuth(columns)).all() and not camera.sees(math.radians(70.0))
+    tilted = lens(tmp_path / "b.json", **SIZE, fx=500.0, pitch_deg=20.0, roll_deg=-3.0)
+    assert (tilted.pitch_rad, tilted.roll_rad) == pytest.approx((math.radians(20.0), math.radians(-3.0)))
 
 
 def test_an_unknown_key_is_refused_and_those_about_boxes_are_read(tmp_path):

@@ -64,13 +64,15 @@ def test_a_skipped_loss_keeps_the_time_and_is_reported() -> None:
 
 
 def test_a_checkpoint_file_continues_from_a_second_before_it(tmp_path: Path) -> None:
-    told = [Odometry("wheels", nanoseconds(at), 0.0) for at in (0.4, 1.4, 2.4)]
-    whole = Listener(THREE, RATE_HZ, model=MODEL)
+    told = [Odometry("wheels", nanoseconds(at), 0.01 * at) for at in (0.4, 1.4, 2.4)]
+    whole, backwards = (Listener(THREE, RATE_HZ, model=MODEL) for _ in range(2))
     whole.add(*told)
-    first, rest = whole.push(SOUND[: 2 * RATE_HZ]), None
+    backwards.add(*reversed(told))
+    first = whole.push(SOUND[: 2 * RATE_HZ])
+    assert backwards.push(SOUND[: 2 * RATE_HZ]) == first
     save_checkpoint(tmp_path / "now.json", whole.checkpoint())
     second = Listener(THREE, RATE_HZ, model=MODEL, resume=tmp_path / "now.json", start_s=0.0)
-    second.add(*reversed(told))
+    second.add(*told)
     rest = second.push(SOUND)
     assert rest == whole.push(SOUND[2 * RATE_HZ :])
     assert [one.stamp_ns for one in first + rest] == [10**8 * tenth for tenth in range(10, 30)]

@@ -326,6 +326,18 @@ def test_a_file_on_standard_input_is_no_raw_sound(tmp_path: Path, kind: str) -> 
         open_sound(RawPcm(io.BytesIO((tmp_path / "a").read_bytes()), RATE_HZ, 3, "s16"))
 
 
+@pytest.mark.parametrize("held", ["floats", "whole numbers"])
+def test_a_header_with_another_encoding_is_refused(tmp_path: Path, held: str) -> None:
+    samples = noise(9000, 3)
+    data = stored(samples, "f32" if held == "floats" else "s32")
+    path = wav_of_24_bits(tmp_path / "a.wav", data, 3)
+    kind = struct.pack("<H", 1 if held == "floats" else 3)
+    path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 1, 3), kind + struct.pack("<H", 3), 1))
+    path.write_bytes(path.read_bytes().replace(struct.pack("<HH", 12, 24), struct.pack("<HH", 12, 32), 1))
+    with pytest.raises(InputFileError, match=r"got samples like those of|finite"):
+        open_audio(path)
+
+
 @pytest.mark.parametrize(("scale", "said"), [(1.0, False), (3.0, False), (32_768.0, True), (2.0**31, True)])
 def test_floats_beyond_full_scale_log_a_warning(tmp_path, scale, said, caplog) -> None:
     soundfile.write(tmp_path / "a.wav", noise() * scale, RATE_HZ, subtype="DOUBLE")

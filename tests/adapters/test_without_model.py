@@ -10,9 +10,10 @@ import pytest
 import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up_sound import plane_wave
 from street_measurements import hop
 
-from worldstate import Listener, MicrophoneArray, WorldFilter, WorldState
+from worldstate import Listener, ListenSettings, MicrophoneArray, WorldFilter, WorldState
 from worldstate.adapters import read_checkpoint, save_checkpoint
 from worldstate.belief.sound_tracks import MOST_SOUNDS
 from worldstate.belief.street_model import StreetModel
@@ -161,6 +162,20 @@ def test_sound_elsewhere_ends_a_track_and_an_edge_starts_none() -> None:
     edges = followed([math.pi / 2.0] * 15, at_edge=True)
     assert not any(state.entities for state in edges)
     assert edges[-1].bearing is not None and edges[-1].bearing.at_edge
+
+
+@pytest.mark.parametrize("azimuth_deg", [-170.0, -120.0, -60.0, 0.0, 100.0, 150.0])
+def test_a_ring_searches_all_directions_or_a_stated_span(azimuth_deg: float) -> None:
+    array = MicrophoneArray(RING)
+    sound = plane_wave(array, RATE, math.radians(azimuth_deg), 2.0)
+    (last,) = Listener(array, RATE).push(sound)[-1:]
+    assert last.bearing is not None and not last.bearing.at_edge
+    assert abs(wrap_angle(last.bearing.azimuth_rad - math.radians(azimuth_deg))) < math.radians(3.0)
+    ahead = Listener(array, RATE, settings=ListenSettings(azimuth_span_deg=120)).push(sound)[-1]
+    assert ahead.bearing is None or ahead.bearing.at_edge is (abs(azimuth_deg) >= 60.0)
+    if abs(azimuth_deg) >= 60.0 and ahead.bearing is not None:
+        assert math.isclose(ahead.bearing.std_rad, math.radians(120.0) / math.sqrt(12.0), rel_tol=1e-6)
+        assert not ahead.entities
 
 
 @given(st.floats(-math.pi, math.pi), st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=8, unique=True))
