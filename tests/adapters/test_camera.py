@@ -264,6 +264,14 @@ def test_boxes_of_larger_images_are_refused_and_others_are_cut(name, caplog):
     assert ("are cut at its border" in caplog.text) == (name != "within")
 
 
+def test_boxes_outside_are_counted_and_an_image_of_them_alone_is_refused():
+    listener = Listener(ovad_array(), 48_000, camera=SMALL)
+    listener.look(0, boxed(INSIDE, OUTSIDE))
+    assert listener.world.state.delivery.refused == 1
+    with pytest.raises(InputFileError, match="640 x 402 px, got a corner"):
+        listener.look(10**8, boxed(OUTSIDE))
+
+
 WRONG = [
     ({"horizontal_fov_deg": 181}, r"camera.horizontal_fov_deg: expected a number in \(0.0, 180.0\), got 181"),
     ({"horizontal_fov_deg": None}, "expected either horizontal_fov_deg or fx"),
