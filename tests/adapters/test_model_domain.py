@@ -356,3 +356,10 @@ def test_calibration_keeps_the_domain_of_the_signature_and_refuses_another(tmp_p
     out.unlink()
     said = refused(["model", "threshold", str(streams), *words])
     assert "made with another model's signature" in said and not out.exists()
+
+
+def test_evaluate_refuses_a_model_of_another_array(tmp_path, capsys) -> None:
+    save_model(tmp_path / "roof.json", model_of(roof_array_56(), RATE))
+    assert study(["table", "--out", str(tmp_path / "e"), "--model", str(tmp_path / "roof.json")]) == 2
+    assert "not the array of the model" in capsys.readouterr().err
+    assert not (tmp_path / "e" / "streets").exists()
