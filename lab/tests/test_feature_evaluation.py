@@ -1,13 +1,12 @@
 """Protocols on artificial windows: no recording in both training and test, every figure reproducible."""
 
-import csv
 import json
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 from sklearn.metrics import roc_auc_score
@@ -18,9 +17,8 @@ from worldstate_lab.features.methods import methods
 from worldstate_lab.features.published_classifier import PublishedClassifier
 
 from worldstate.abduction.cueing.risk_map import fit_platt
-from worldstate.abduction.signature.window_classes import hazard_statistic
-from worldstate.adapters.datasets.feature_table import FEATURE_COLUMNS, LABEL_COLUMNS, FeatureTable
-from worldstate.adapters.files.model_file import read_model
+from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
+from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.cli.main import main
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.operations.training.site_references import STREAMS
@@ -33,10 +31,6 @@ from worldstate.operations.training.training import (
 )
 
 JUNCTIONS = ("SA1", "SB1", "SB2")
-KEYS = {
-    "accuracy", "auroc_macro", "auroc_pooled", "worst_group_auroc", "alpha", "tpr", "fpr",
-    "ece", "ece_floor", "n_windows", "per_group",
-}  # fmt: skip
 
 
 def made_up_table(seed=0, recordings=72, spread=1.5):
@@ -54,19 +48,14 @@ def made_up_table(seed=0, recordings=72, spread=1.5):
     return FeatureTable(np.array(features), *map(np.array, labels), (None,) * len(rows))
 
 
-def write_csv(path, table):
-    columns = [table.labels, table.ids, table.environments, table.recordings]
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([*FEATURE_COLUMNS, *LABEL_COLUMNS])
-        for feature, label, name, place, recording in zip(table.features, *columns, strict=True):
-            writer.writerow([*feature.tolist(), label, name, place, "", recording])
+def written(path, table):
+    write_features(path, table)
     return path
 
 
 @pytest.fixture(scope="module")
 def csv_path(tmp_path_factory):
-    return write_csv(tmp_path_factory.mktemp("table") / "windows.csv", made_up_table())
+    return written(tmp_path_factory.mktemp("table") / "windows.csv", made_up_table())
 
 
 def command(*words):
@@ -163,10 +152,8 @@ def test_every_figure_can_be_recomputed_from_the_predictions(protocol):
     hazard = table.labels[scored] != "none"
     accuracy, areas, rates = [], [], []
     for one in passes["baseline"]:
-        front, left, none, right = one.probabilities.T
-        likeliest = np.array(["front", "left", "none", "right"])[
-            np.argmax([front, left, none, right], axis=0)
-        ]
+        _, left, _, right = one.probabilities.T
+        likeliest = np.array(CLASSES)[np.argmax(one.probabilities, axis=1)]
         accuracy.append(np.mean(likeliest == table.labels))
         areas.append(roc_auc_score(hazard, one.score[scored]))
         rates.append((one.decision[scored][hazard].mean(), one.decision[scored][~hazard].mean()))
@@ -185,7 +172,9 @@ def test_the_same_command_prints_the_same_with_every_junction(csv_path, capsys):
         assert command("windows", csv_path, "--method", "baseline", "--seeds", 1, form) == 0
         outputs.append(capsys.readouterr().out)
     assert outputs[0] == outputs[1]
-    assert set(json.loads(outputs[0])) >= KEYS
+    figures = json.loads(outputs[0])
+    for key, (low, high) in figures["intervals"].items():
+        assert low <= high and (key == "ece" or low - 1e-9 <= figures[key] <= high + 1e-9)
     assert all(junction in outputs[2] for junction in JUNCTIONS)
 
 
@@ -202,30 +191,7 @@ def test_train_writes_exactly_its_path_and_leaves_out_listed_recordings(csv_path
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ids.csv", "m"]
     refused(capsys, r"trained on 66 of these 72 recordings.*--exclude", "windows", csv_path, "--model", model)
     assert command("windows", csv_path, "--model", model, "--only", ids, "--reference", "cold", "--json") == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert figures["n_windows"] == 8
-    assert set(figures) >= KEYS
-
-
-@pytest.mark.long
-def test_the_shipped_model_is_that_of_train_with_its_defaults(csv_path, tmp_path):
-    assert command("fit", csv_path, "--out", tmp_path / "m") == 0
-    assert type(read_model(tmp_path / "m").signature) is type(read_model(None).signature)
-
-
-@pytest.mark.long
-def test_simulated_windows_are_used_in_training_and_listed_in_the_card(tmp_path):
-    table = made_up_table(recordings=30)
-    real, more = (write_csv(tmp_path / name, table) for name in ("real.csv", "more.csv"))
-    assert command("fit", real, "--simulated", more, more, "--out", tmp_path / "m") == 0
-    assert f"{2 * len(table)} simulated" in read_model(tmp_path / "m").provenance.classifier
-
-
-def test_a_site_with_one_recording_is_rejected(csv_path, tmp_path, capsys):
-    table = made_up_table()
-    lonely = table.select((table.environments != "SA1") | (table.recordings == table.recordings[0]))
-    path = write_csv(tmp_path / "lonely.csv", lonely)
-    refused(capsys, "another recording of its junction", "fit", path, "--out", tmp_path / "m")
+    assert json.loads(capsys.readouterr().out)["n_windows"] == 8
 
 
 def test_bad_requests_are_rejected(csv_path, tmp_path, capsys):
@@ -233,25 +199,18 @@ def test_bad_requests_are_rejected(csv_path, tmp_path, capsys):
     refused(capsys, "seeds", "windows", csv_path, "--seeds", 0)
     refused(capsys, "alpha", "windows", csv_path, "--alpha", 1.5, "--seeds", 1)
     refused(capsys, "nowhere", "fit", csv_path, "--out", tmp_path / "nowhere" / "m")
-    one = made_up_table().select(made_up_table().environments == "SA1")
-    refused(capsys, "two junctions", "windows", write_csv(tmp_path / "one.csv", one), "--protocol", "lojo")
+    table = made_up_table()
+    one = written(tmp_path / "one.csv", table.select(table.environments == "SA1"))
+    refused(capsys, "two junctions", "windows", one, "--protocol", "lojo")
+    lonely = table.select((table.environments != "SA1") | (table.recordings == table.recordings[0]))
+    path = written(tmp_path / "lonely.csv", lonely)
+    refused(capsys, "another recording of its junction", "fit", path, "--out", tmp_path / "m")
 
 
 def of_sites(recordings, sites):
     words = np.array(["none"] * len(recordings))
     columns = (np.array(sites), np.array(recordings))
     return FeatureTable(np.ones((len(recordings), 60)), words, words, *columns, (None,) * len(recordings))
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10_000), st.floats(0.05, 0.95), st.floats(-6.0, 6.0))
-def test_a_shift_common_to_a_site_is_undone(seed, mean, shift):
-    rng = np.random.default_rng(seed)
-    log_odds = rng.normal(0.0, 2.0, 30)
-    here = of_sites([str(i) for i in range(30)], ["DA1"] * 15 + ["DB1"] * 15)
-    there = log_odds + shift * (np.arange(30) < 15)
-    matched = matched_risk(expit(there), here, mean)
-    np.testing.assert_allclose(matched, matched_risk(expit(log_odds), here, mean), atol=1e-4)
 
 
 def test_the_mean_is_that_of_the_other_recordings():

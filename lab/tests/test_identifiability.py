@@ -1,6 +1,8 @@
 """Bounds in closed form, estimates against exact values, laws of information."""
 
+import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 from sklearn.feature_selection import mutual_info_classif
 from sklearn.linear_model import LogisticRegression
+from test_feature_evaluation import made_up_table, written
+from worldstate_lab.cli.main import main
 from worldstate_lab.paper.identifiability import (
     entropy_bits,
     fano_bound,
@@ -24,10 +28,6 @@ from worldstate.frontend.array.microphone_array import MicrophoneArray, roof_arr
 from worldstate.ground.errors import InvalidArgumentError
 
 
-def binary_entropy(p):
-    return entropy_bits([p, 1.0 - p])
-
-
 def mutual_information_bits(joint):
     """Return the exact I(z; x) of a joint table by its definition."""
     independent = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
@@ -38,15 +38,6 @@ def mutual_information_bits(joint):
 joints = st.tuples(st.integers(2, 5), st.integers(2, 5)).flatmap(
     lambda shape: arrays(float, shape, elements=st.floats(0.001, 1.0)).map(lambda p: p / p.sum())
 )
-
-
-@given(st.floats(0.001, 0.499))
-def test_the_binary_symmetric_channel(flip):
-    joint = 0.5 * np.array([[1 - flip, flip], [flip, 1 - flip]])
-    information = mutual_information_bits(joint)
-    assert information == pytest.approx(1.0 - binary_entropy(flip), abs=1e-9)
-    # The symmetric channel attains Fano's bound: its best detector errs with the flip probability.
-    assert sharp_fano_bound(1.0, information, 2) == pytest.approx(flip, abs=1e-6)
 
 
 @given(st.integers(2, 12), st.floats(0.01, 0.99))
@@ -88,7 +79,7 @@ def exact_posteriors(x, distance):
     return np.stack([1 - odds, odds], axis=1)
 
 
-@pytest.mark.parametrize("distance", [0.5, 1.5, 3.0])
+@pytest.mark.parametrize("distance", [0.0, 0.5, 1.5, 3.0])
 def test_estimates_agree_with_the_exact_value_of_two_gaussians(distance):
     x, z = gaussian_sample(20_000, distance)
     exact = gaussian_information_bits(distance)
@@ -108,14 +99,6 @@ def test_an_uncalibrated_classifier_lowers_the_bound_and_biases_the_plug_in(shar
     exact = gaussian_information_bits(1.5)
     assert found.lower < exact - 0.03
     assert (found.plug_in > exact) == (sharpness > 1)
-
-
-def test_independent_windows_carry_no_information():
-    rng = np.random.default_rng(0)
-    x, z = rng.normal(size=(3000, 2)), rng.integers(0, 3, 3000)
-    assert nearest_neighbour_information_bits(x, z) < 0.03
-    flat = information_from_posteriors(np.full((3000, 3), 1 / 3), z)
-    assert flat.lower == pytest.approx(0.0, abs=0.01)
 
 
 def test_the_endfire_corollary_on_a_line_across_the_vehicle():
@@ -152,3 +135,16 @@ def test_bounds_of_any_detector_on_data():
 def test_a_state_with_few_windows_has_no_neighbours():
     with pytest.raises(InvalidArgumentError, match="more than 3 windows"):
         nearest_neighbour_information_bits([[0.0], [1.0]], [0, 1])
+
+
+def test_the_command_prints_the_bounds_of_a_table_and_of_the_array(tmp_path, capsys):
+    made_up = made_up_table(recordings=60)
+    table = written(tmp_path / "t.csv", replace(made_up, features=np.exp(0.3 * made_up.features)))
+    assert main(["reach", "--features", str(table), "--method", "baseline", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    data, array = found["features"], found["array"]
+    assert data["fano"] <= data["sharp_fano"] <= data["error"]
+    assert 0.0 < data["information_lower"] <= data["information_high"] <= data["entropy_bits"]
+    assert array["std_rad"][0] is None
+    assert array["with_vision_rad"][0] == pytest.approx(np.radians(1.0))
+    assert min(x for x in array["std_rad"] if x is not None) == array["std_rad"][6]
