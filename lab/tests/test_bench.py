@@ -1,14 +1,15 @@
-"""The benchmark prints all its rows; its speed is not tested."""
+"""The benchmarks of cost and of estimates; the speed is not tested."""
 
 import json
 
 import numpy as np
 import pytest
+from test_passes import heard, stream
 from worldstate_lab.benchmarks.hop_costs import EVIDENCE, FRONT_END, RATE_HZ, vehicle_hops
 from worldstate_lab.cli.bench.cost import EVERYTHING, plane_wave, shipped_listener
 from worldstate_lab.cli.main import main
 
-from worldstate import WorldFilter
+from worldstate import Context, WorldFilter
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.frontend.approach.looming import Looming
 from worldstate.frontend.approach.tone import ToneReading
@@ -54,3 +55,21 @@ def test_the_timed_sound_exercises_every_stage():
     # Sound of another array would be refused: no evidence would be timed.
     *_, last = shipped_listener().steps(sound)
     assert isinstance(last.measurement.sequence, SequenceReading)
+
+
+def test_no_estimate_costs_half_the_cutoff_and_trackers_follow_the_boxes():
+    pytest.importorskip("stonesoup", reason="the benchmark's trackers: pip install 'worldstate[oracles]'")
+    from worldstate_lab.cli.bench import gospa
+
+    made_up = stream([("left", "left", 8.0)], duration_s=12.0)
+    costs, hops = gospa.costs(made_up, heard(made_up), WorldFilter(Context()))
+    assert hops.tolist() == pytest.approx([50, 24], abs=1)
+    per_hop = {method: cost / hops[:, None] for method, cost in costs.items()}
+    # One vehicle without an estimate: 30 degrees per hop for a miss, and no other costs.
+    np.testing.assert_allclose(per_hop[gospa.SILENCE], [[0.0, 30.0, 0.0]] * 2, atol=1e-9)
+    hidden, visible = per_hop[gospa.WORLD].sum(axis=1)
+    assert hidden < 15.0 and visible < 15.0
+    for tracker in (gospa.UNHEARING, gospa.OC_SORT, gospa.GM_PHD, gospa.JPDA):
+        hidden, visible = per_hop[tracker].sum(axis=1)
+        # Without sound, no method detects a vehicle before its first box; with boxes, every method tracks it.
+        assert hidden >= 29.0 and visible < 20.0 and per_hop[tracker][1, 0] < 10.0

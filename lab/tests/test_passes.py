@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,11 @@ from hop_tables import heard_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, lfilter, sosfilt
-from snapshot_laws import broken_laws
 from worldstate_lab.cli import scenarios
 from worldstate_lab.cli.scenarios import scenario_figures
 from worldstate_lab.cli.streams import worst_of
+from worldstate_lab.cli.street import Facts, camera_numbers, vehicle_facts
+from worldstate_lab.passes.budget_days import budget_days, chance_blocks, quiet_blocks
 from worldstate_lab.passes.followed_stream import (
     EVERYBODY,
     FollowedStream,
@@ -32,30 +33,24 @@ from worldstate_lab.passes.pass_outcomes import (
 )
 
 from worldstate import Context, Measurement, NotUsable, SignatureEvidence, WorldFilter, nanoseconds
-from worldstate.abduction.co_evidence import Unqueried
+from worldstate.abduction.co_evidence import Present, Unqueried
 from worldstate.abduction.road_users import Foreign, neutral
-from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, SequenceAlarm
+from worldstate.abduction.sequence.sequence_model import COMING_S, GROUPS, HORIZONS_S, SequenceAlarm
 from worldstate.abduction.sequence.sequence_reader import SequenceReading
 from worldstate.adapters.acoustic import asked_again, beside_foreign
 from worldstate.adapters.camera.pinhole import PinholeCamera
 from worldstate.adapters.camera.vision_query import VisionQuery
 from worldstate.adapters.files.model_file import read_model
-from worldstate.adapters.listener import learn_passes
-from worldstate.adapters.source import street_listener
 from worldstate.belief.hidden_bearing import hidden_bearing
 from worldstate.belief.site_geometry import SideGeometry
-from worldstate.commissioning.heard_stream import (
-    HeardStream,
-    StreamSettings,
-    hear_stream,
-    junction_named,
-    traffic_named,
-)
+from worldstate.commissioning.heard_stream import HeardStream, StreamSettings, junction_named, traffic_named
 from worldstate.commissioning.sequence_training import stream_truth
-from worldstate.frontend.array.microphone_array import ovad_array
+from worldstate.ground.errors import InvalidArgumentError
+from worldstate.measurement.measurement import Look, Sighting
 from worldstate.operations.metrics.approach_table import Figures
 from worldstate.simulation.dataset.recording import FULL_SCALE_PA
 from worldstate.state import SideShare
+from worldstate.state.cue import Tally
 
 Vehicle = tuple[str, str, float]  # flow, arm, T0; "from_ahead" comes along the ego's own street
 CORNER_RAD, STREET_M, PACE_MPS = math.radians(32.0), 9.0, 4.5
@@ -329,37 +324,93 @@ def test_a_known_edge_narrows_the_bearing_and_keeps_the_errors_of_the_time(edge_
     assert variance(edge_deg) - variance(5.0) == pytest.approx(expected, abs=1e-6)
 
 
-def test_no_estimate_costs_half_the_cutoff_and_trackers_follow_the_boxes() -> None:
-    pytest.importorskip("stonesoup", reason="the benchmark's trackers: pip install 'worldstate[oracles]'")
-    import worldstate_lab.cli.bench.gospa as bench
-
-    made_up = stream([("left", "left", 8.0)], duration_s=12.0)
-    costs, hops = bench.costs(made_up, heard(made_up), WorldFilter(Context()))
-    assert hops.tolist() == pytest.approx([50, 24], abs=1)
-    per_hop = {method: cost / hops[:, None] for method, cost in costs.items()}
-    # One vehicle without an estimate: 30 degrees per hop for a miss, and no other costs.
-    np.testing.assert_allclose(per_hop[bench.SILENCE], [[0.0, 30.0, 0.0]] * 2, atol=1e-9)
-    hidden, visible = per_hop[bench.WORLD].sum(axis=1)
-    assert hidden < 15.0 and visible < 15.0
-    for tracker in (bench.UNHEARING, bench.OC_SORT, bench.GM_PHD, bench.JPDA):
-        hidden, visible = per_hop[tracker].sum(axis=1)
-        # Without sound, no method detects a vehicle before its first box; with boxes, every method tracks it.
-        assert hidden >= 29.0 and visible < 20.0 and per_hop[tracker][1, 0] < 10.0
+HOUR = 36_000  # One hour
+BUDGET = 25.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(8))
-def test_every_snapshot_of_a_stream_obeys_the_laws(seed: int, tmp_path: Path) -> None:
-    """Fifteen minutes each, two hours together."""
-    streets = [junction_named(name) for name in ("SA1", "SA2", "SB1", "SB2")]
-    settings = StreamSettings(streets[seed % 4], 15.0, seed, traffic_named("pairs"), sample_rate_hz=6000.0)
-    (heard,) = hear_stream(settings, [ovad_array()])
-    heard.save(tmp_path / "stream.npz")
-    model, world, before = read_model(), WorldFilter(), None
-    street = street_listener(model.domain, None, None)
-    for one in stream_measurements(tmp_path / "stream.npz", model, "all", seed, street)[1]:
-        world = world.update(one)
-        learn_passes(street, world.state)
-        assert broken_laws(world.state, before) == []
-        before = world.state
-    assert before is not None and before.stamp_ns > 890 * 10**9
+@dataclass(frozen=True)
+class MadeUp:
+    """The fields of a stream and of its beliefs from which days are drawn."""
+
+    tallies: tuple[Tally, ...]
+    within: np.ndarray
+    coming_s: np.ndarray
+    hazard_free: bool = False
+
+    followed = truth = heard = property(lambda self: self)
+
+
+def hour(per_hour: float, seed: int, chance: float = 0.05, true: float = 0.05) -> MadeUp:
+    """Return an hour with random onsets, and chances for two seconds of which a share comes true."""
+    rng = np.random.default_rng(seed)
+    false = np.cumsum(rng.random(HOUR) < per_hour / HOUR).tolist()
+    tallies = tuple(Tally(quiet_ns=100_000_000 * k, false_onsets=n) for k, n in enumerate(false, 1))
+    came = np.repeat(rng.random((HOUR // 20, 2)) < true, 20, axis=0)
+    within = np.full((HOUR, 2, len(HORIZONS_S)), chance)
+    return MadeUp(tallies, within, np.where(came, 1.0, np.inf))
+
+
+def test_every_onset_of_whole_blocks_is_in_the_block_in_which_it_came() -> None:
+    streams = [hour(60.0, seed) for seed in (1, 2)]
+    blocks = quiet_blocks(streams)
+    assert blocks.shape == (20, 36)
+    assert blocks.sum() == sum(one.tallies[-1].false_onsets for one in streams)
+    assert blocks[0].sum() == streams[0].tallies[3599].false_onsets
+    assert chance_blocks(streams).shape == (20, 180, 2)
+
+
+def test_a_kept_budget_is_not_reported_and_larger_excess_is_detected_sooner() -> None:
+    streams = [hour(12.0, seed) for seed in range(6)]
+    found = dict(budget_days(streams, BUDGET, 40, np.random.default_rng(0)))
+    assert found["as they are"]["broken"] == found["chances"]["broken"] == 0.0
+    assert found["the budget"]["broken"] <= 0.1
+    twice, ten, later = (found[name] for name in ("2 times", "10 times", "2 times, after six hours"))
+    assert twice["broken"] == ten["broken"] == later["broken"] == 1.0
+    assert ten["median_h"] < 0.25 < twice["median_h"] < later["median_h"] < 6.0
+
+
+@pytest.mark.parametrize(("chance", "true"), [(0.4, 0.02), (0.02, 0.4)])
+def test_chances_that_do_not_come_true_are_detected(chance: float, true: float) -> None:
+    streams = [hour(12.0, 1, chance, true)]
+    found = dict(budget_days(streams, BUDGET, 5, np.random.default_rng(0)))
+    assert found["chances"]["broken"] == 1.0
+
+
+def test_streams_without_a_false_onset_are_rejected() -> None:
+    with pytest.raises(InvalidArgumentError, match=r"expected false onsets .*, got none in 60 minutes"):
+        next(budget_days([hour(0.0, 1)], BUDGET, 1, np.random.default_rng(0)))
+
+
+@given(st.lists(st.floats(3.0, 9.0), min_size=2, max_size=5))
+@settings(max_examples=10)
+def test_distances_and_times_in_view_are_those_of_the_drawn_vehicles(gaps_s: list[float]) -> None:
+    entries_s = np.round(9.0 + np.cumsum(gaps_s), 1).tolist()
+    facts, heard = Facts(list), stream([("left", "left", one) for one in entries_s])
+    hidden_rad, lone_rad = vehicle_facts(heard, facts)
+    edge_m = STREET_M * math.tan(CORNER_RAD)
+    assert np.mean(facts["view_s"]) == pytest.approx(2.0 * edge_m / PACE_MPS, abs=0.11)
+    assert facts["gap_s"] == pytest.approx([*np.diff(entries_s), math.inf])
+    # Along a street at a distance d a bearing turns by v / d times the square of its cosine.
+    azimuth, turned = np.array(facts["log"]).imag, np.array(facts["rate"]).imag
+    assert np.median(turned / np.cos(azimuth) ** 2) == pytest.approx(-PACE_MPS / STREET_M, rel=0.02)
+    assert np.nanmin(hidden_rad[:, 0]) > CORNER_RAD > np.nanmax(lone_rad) and np.isnan(hidden_rad[:, 1]).all()
+
+
+@given(st.floats(0.02, 0.3), st.integers(2, 9), st.integers(0, 4))
+@settings(max_examples=10)
+def test_tracks_single_boxes_and_growth_are_counted(growth: float, vehicles: int, single: int) -> None:
+    """Every vehicle has six images, then none for a second; single boxes are in images of their own."""
+    silent, look, hops = NotUsable("-"), Present(0.05, 0.01), []
+    for image in range(16 * (vehicles + single)):
+        number, at = divmod(image, 16)
+        is_there = at < (6 if number < vehicles else 1)
+        box = Sighting(0.5 - 0.01 * at, 0.02, "car", 0.9, 0.05 * math.exp(growth * at))
+        stamp_ns = 10**8 * (image + 1)
+        seen = Look("camera", stamp_ns, look)
+        sightings = (box,) if is_there else ()
+        hops.append(Measurement(stamp_ns, DUMB, look, silent, silent, look=seen, sightings=sightings))
+    found = camera_numbers([hops])
+    assert found["clutter"] == pytest.approx(single / len(hops))
+    assert found["width_change"] == pytest.approx(growth) and found["size_spread"] == pytest.approx(
+        0.0, abs=1e-9
+    )
