@@ -1,52 +1,111 @@
-"""The signature study: separability by a linear signature, on other recordings and on the other corpus."""
+"""Single clips: signatures of vehicles against background, and kinds of road users."""
 
+import csv
 import json
-from dataclasses import replace
+from zlib import crc32
 
 import numpy as np
 import pytest
+import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_traffic_corpora import write_idmt, write_sound
+from scipy.stats import ttest_ind
+from worldstate_lab.cli.clips import ClipNumbers, judged, read_clips
 from worldstate_lab.cli.main import main
 from worldstate_lab.signatures.clip_signatures import (
     ClipSignatures,
-    hear_clips,
+    discriminative_range_hz,
+    fisher_profile,
+    level_invariant_shape,
     signature,
     signature_edges_hz,
 )
-from worldstate_lab.signatures.signature_study import (
-    area,
-    balanced_accuracy,
-    held_out,
-    interval,
-    scores_of,
-    signature_study,
-    transferred,
+from worldstate_lab.signatures.signature_study import area, held_out, scores_of, transferred
+from worldstate_lab.signatures.traffic_clips import (
+    BACKGROUND,
+    CLIP_S,
+    KINDS,
+    ClipLabels,
+    idmt_traffic,
+    read_clip,
 )
-from worldstate_lab.signatures.traffic_clips import BACKGROUND, KINDS, ClipLabels, melaudis
+
+from worldstate.abduction.road_users import RoadUserModel
+from worldstate.adapters.files.model_file import read_model
+from worldstate.ground.errors import InvalidArgumentError
 
 RATE_HZ = 24_000
+CAR = "2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_1272258_M_D_CR"
+EMPTY = "2019-11-19-13-10_Langewiesener-Strasse_unknownKmh_10077440"
+IDMT_NAMES = [f"{CAR}_ME_CH12", f"{CAR}_SE_CH34", f"{EMPTY}_SE_CH34-BG", f"{EMPTY}_ME_CH12-BG"]
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    """Return four recordings of IDMT-Traffic, two of them for tests, and two days of MELAUDIS."""
-    idmt, city = (tmp_path_factory.mktemp(name) for name in ("idmt", "melaudis"))
-    names = [
-        f"2019-11-12-15-3{number}_Site{number // 2}_50Kmh_{10 * number + i}{what}_{microphone}{end}"
-        for number in range(4)
-        for i, (what, end) in enumerate([(f"_M_D_{one}L", "") for one in "CTT"] + [("", "-BG")] * 3)
-        for microphone in ("SE_CH34", "ME_CH12")
-    ]
-    write_idmt(idmt, names, [name for name in names if name[15] in "13"], RATE_HZ)
-    for day in (10, 11):
-        for i, token in enumerate((*KINDS, *["BG"] * 3)):
-            place = city / ("MELAUDIS_BG" if token == "BG" else "MELAUDIS_Vehicles")
-            write_sound(
-                place / f"2024-01-{day}_13-{i}-0.0-Fitzroy1_FF_1V-{token}_LR_stereo.wav", rate_hz=RATE_HZ
-            )
-    return idmt, city
+def write_sound(path, seconds=CLIP_S, rate_hz=8000):
+    """Write noise that is louder if a vehicle passes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(crc32(path.name.encode()))
+    most = 0.1 if "BG" in path.parent.name + path.name else 0.3
+    soundfile.write(path, rng.uniform(-most, most, (round(seconds * rate_hz), 2)), rate_hz)
+
+
+def write_idmt(root, names=IDMT_NAMES, test=IDMT_NAMES[2:], rate_hz=8000):
+    (root / "annotation").mkdir(parents=True)
+    lists = {"idmt_traffic_all": names, "eusipco_2021_test": test}
+    lists["eusipco_2021_train"] = [name for name in names if name not in test]
+    for name, lines in lists.items():
+        (root / "annotation" / f"{name}.txt").write_text("".join(f"{line}.wav\n" for line in lines))
+    for name in names:
+        write_sound(root / "audio" / f"{name}.wav", rate_hz=rate_hz)
+    return root
+
+
+def write_melaudis(root, day="2024-02-09", seconds=61.0, rate_hz=8000):
+    for token in KINDS:
+        name = f"{day}_13-62-1.8-Fitzroy1_FF_1V-{token}_L1_2Lanes_LR_stereo.wav"
+        write_sound(root / "MELAUDIS_Vehicles" / "Final_Veh" / "Fit1" / name, rate_hz=rate_hz)
+    write_sound(root / "MELAUDIS_BG" / f"night-{day}.wav", seconds, rate_hz)
+    write_sound(root / "MELAUDIS_BG" / f"{day}_15-1-2.0-Fitzroy1_2L.wav", 1.4, rate_hz)
+    return root
+
+
+def test_idmt_clips_have_the_labels_of_their_names(tmp_path):
+    clips = idmt_traffic(write_idmt(tmp_path))
+    labels = [clip.labels for clip in clips]
+    assert [one.kind for one in labels] == ["car", "car", BACKGROUND, BACKGROUND]
+    assert [one.microphone for one in labels] == ["mems", "studio", "studio", "mems"]
+    assert [one.split for one in labels] == ["train", "train", "test", "test"]
+    assert [one.site for one in labels[::2]] == ["Fraunhofer-IDMT", "Langewiesener-Strasse"]
+    # Both microphones recorded one passage: a fold that separated them would test on training data.
+    assert labels[0].recording == labels[1].recording != labels[2].recording == labels[3].recording
+    samples, rate_hz = read_clip(clips[0])
+    assert (samples.shape, rate_hz) == ((16_000, 2), 8000.0)
+
+
+def test_the_profile_is_welchs_t_squared_over_n_and_finds_the_band_of_vehicle_sound():
+    rng = np.random.default_rng(1)
+    edges = np.geomspace(50.0, 8000.0, 17)
+    heard = (edges[:-1] > 290) & (edges[1:] < 1900)
+    background = rng.normal(0.0, 1.0, (400, 16)) + rng.normal(0, 3, (400, 1))
+    vehicle = rng.normal(0.0, 1.0, (400, 16)) + rng.normal(0, 3, (400, 1)) + 2.0 * heard
+    with_level = fisher_profile(vehicle, background)
+    t = ttest_ind(vehicle, background, equal_var=False).statistic
+    np.testing.assert_allclose(with_level, t**2 / 400)
+    shapes = level_invariant_shape(vehicle), level_invariant_shape(background)
+    np.testing.assert_allclose(np.diff(shapes[0], axis=1), np.diff(vehicle, axis=1), atol=1e-9)
+    profile = fisher_profile(*shapes)
+    assert profile[heard].min() > 3 * with_level[heard].max()
+    assert discriminative_range_hz(profile, edges) == (edges[:-1][heard][0], edges[1:][heard][-1])
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(-40.0, 20.0), st.sampled_from((44_100.0, 32_000.0, 24_000.0)))
+def test_a_tone_is_in_its_band_with_its_level_at_any_sample_rate(level_db, rate_hz):
+    amplitude, band = 0.1 * 10.0 ** (level_db / 20.0), 9
+    edges = signature_edges_hz()
+    tone = np.sin(2.0 * np.pi * np.mean(edges[band : band + 2]) * np.arange(2 * rate_hz) / rate_hz)
+    found = signature(np.float32(amplitude * tone)[:, None], rate_hz)
+    assert found.argmax() == band
+    assert found[band] == pytest.approx(np.log(amplitude**2 / 2.0), abs=0.05)
 
 
 def drawn(rng, recordings, clips, *, fingerprint=0.0, lift=0.0):
@@ -61,17 +120,6 @@ def drawn(rng, recordings, clips, *, fingerprint=0.0, lift=0.0):
     return ClipSignatures.of("drawn", rows)
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.floats(-40.0, 20.0), st.sampled_from((44_100.0, 32_000.0, 24_000.0)))
-def test_a_tone_is_in_its_band_with_its_level_at_any_sample_rate(level_db, rate_hz):
-    amplitude, band = 0.1 * 10.0 ** (level_db / 20.0), 9
-    edges = signature_edges_hz()
-    tone = np.sin(2.0 * np.pi * np.mean(edges[band : band + 2]) * np.arange(2 * rate_hz) / rate_hz)
-    found = signature(np.float32(amplitude * tone)[:, None], rate_hz)
-    assert found.argmax() == band
-    assert found[band] == pytest.approx(np.log(amplitude**2 / 2.0), abs=0.05)
-
-
 def test_a_recording_is_never_scored_by_a_model_trained_on_it():
     learned, kept = [], []
     for rng in np.random.default_rng(0).spawn(6):
@@ -84,36 +132,23 @@ def test_a_recording_is_never_scored_by_a_model_trained_on_it():
     assert how == "5 folds by recording"
 
 
-def test_another_gain_shifts_the_threshold_but_not_the_area():
-    rng = np.random.default_rng(2)
-    home, away = (drawn(rng, recordings=10, clips=20, lift=3.0) for _ in range(2))
-    louder = replace(away, energy=away.energy + 9.0)
-    found = (transferred(home, louder, by) for by in ("level", "shape"))
-    by_level, by_shape = (scores_of(louder, score, louder.motor) for score in found)
-    assert area(by_level) > 0.99
-    assert balanced_accuracy(by_level) == 0.5, "everything is called a vehicle"
-    unmoved = scores_of(away, transferred(home, away, "shape"), away.motor)
-    np.testing.assert_allclose(by_shape.score, unmoved.score, atol=1e-9)
-
-
-def test_clips_repeated_within_their_recordings_do_not_narrow_the_interval():
-    table = drawn(np.random.default_rng(3), recordings=12, clips=5, fingerprint=1.0, lift=0.3)
-    once = scores_of(table, table.energy.mean(axis=1), table.motor)
-    often = once.select(np.repeat(np.arange(len(once.score)), 7))
-    low, high = interval(area, once, np.random.default_rng(4))
-    assert interval(area, often, np.random.default_rng(4)) == pytest.approx((low, high))
-    assert low < area(once) < high
-
-
 @pytest.mark.long
-def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_path, capsys):
-    idmt, city = folders
+def test_the_command_fills_every_row_of_two_corpora(tmp_path, capsys):
+    names = [
+        f"2019-11-12-15-3{number}_Site{number // 2}_50Kmh_{10 * number + i}{what}_{microphone}{end}"
+        for number in range(4)
+        for i, (what, end) in enumerate([(f"_M_D_{one}L", "") for one in "CTT"] + [("", "-BG")] * 3)
+        for microphone in ("SE_CH34", "ME_CH12")
+    ]
+    idmt = write_idmt(tmp_path / "idmt", names, [name for name in names if name[15] in "13"], RATE_HZ)
     broken = next((idmt / "audio").glob("*_CL_SE_*"))
     broken.write_bytes(broken.read_bytes()[: broken.stat().st_size // 2])
-    words = ["corpora", "--idmt", idmt, "--melaudis", city, "--out", tmp_path, "--json"]
-    assert main([*map(str, words)]) == 0
+    for day in ("2024-01-10", "2024-01-11"):
+        city = write_melaudis(tmp_path / "city", day, 6.0, RATE_HZ)
+    words = ["--idmt", str(idmt), "--melaudis", str(city), "--out", str(tmp_path / "out"), "--json"]
+    assert main(["corpora", *words]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report == json.loads((tmp_path / "signatures.json").read_text())
+    assert report == json.loads((tmp_path / "out" / "signatures.json").read_text())
     rows = {(row["name"], row["corpus"], row["figure"]): row for row in report["rows"]}
     assert all(row["value"] is not None for row in rows.values())
     studio = rows["vehicle by level, studio microphones", "IDMT-Traffic", "AUROC"]
@@ -124,24 +159,56 @@ def test_the_command_fills_the_rows_of_the_folders_that_are_given(folders, tmp_p
     # Two recordings for the test, each with a car, two trucks and three clips of background.
     assert rows["vehicle by level, mems microphones", "IDMT-Traffic", "AUROC"]["n_clips"] == 12
     assert [problem for problem in report["left_out"] if broken.name in problem] == report["left_out"] != []
+    assert main(["corpora"]) == 2
+    assert "expected --idmt, --melaudis or both" in capsys.readouterr().err
 
 
-def test_rows_of_a_missing_corpus_contain_the_command_that_computes_them(folders):
-    table = hear_clips("city", melaudis(folders[1]))
-    rows = signature_study(None, table, np.random.default_rng(0)).rows
-    notes = {row.note for row in rows if row.value is None}
-    assert "worldstate-lab corpora --idmt DIR" in notes
-    assert "worldstate-lab corpora --idmt DIR --melaudis DIR" in notes
-    assert all(row.value is not None for row in rows if row.name == "tram by level, phone microphones")
+def test_files_of_several_rates_and_lengths_are_processed(tmp_path, capsys):
+    rng, rows = np.random.default_rng(1), []
+    for number, (rate, seconds, channels) in enumerate([(8000, 3.0, 1), (22050, 4.0, 2), (48000, 1.0, 1)]):
+        sound = 0.1 * rng.standard_normal((round(rate * seconds), channels))
+        soundfile.write(tmp_path / f"{number}.wav", sound, rate)
+        rows.append((f"{number}.wav", "noise", f"r{number}", "car" if number == 1 else ""))
+    path = tmp_path / "clips.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("file", "kind", "recording", "road_user"), *rows])
+    clips = read_clips(path, None)
+    # The shortest is extended at its start by its mirror image, so that every hop has numbers.
+    assert np.bincount(clips.clip).tolist() == [10, 20, 11]
+    np.savez(tmp_path / "heard.npz", character=clips.measures, clip=clips.clip)
+    assert main(["clips", str(path), "--json"]) == 0
+    by_files = json.loads(capsys.readouterr().out)
+    assert main(["clips", str(path), "--numbers", str(tmp_path / "heard.npz"), "--json"]) == 0
+    by_numbers = json.loads(capsys.readouterr().out)
+    assert by_numbers["kinds"] == by_files["kinds"]
+    told = by_files["kinds"]["noise"]
+    assert told["recordings"] == 3
+    assert told["familiar"] + told["foreign"] + told["signal"] == pytest.approx(1.0)
+    assert sum(told["road_users"].values()) == pytest.approx(1.0)
+    assert by_files["kinds_log_loss_prior"] == 0.0
+    np.savez(tmp_path / "few.npz", character=np.zeros((3, 7)), clip=np.zeros(3, int))
+    assert main(["clips", str(path), "--numbers", str(tmp_path / "few.npz")]) == 2
+    assert "49 numbers" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        (["--idmt", "."], "missing: annotation/idmt_traffic_all.txt"),
-        ([], "expected --idmt, --melaudis or both"),
-    ],
-)
-def test_without_a_corpus_the_command_is_rejected(words, problem, capsys):
-    assert main(["corpora", *words]) == 2
-    assert problem in capsys.readouterr().err
+def test_probabilities_are_corrected_to_the_shares_of_the_table():
+    """For two inseparable kinds the log-loss is that of the table's own shares, in closed form."""
+    shipped = read_model()
+    assert shipped.guard is not None
+    inputs = 49
+    model = RoadUserModel(
+        tuple(map(str, range(inputs))),
+        *(("car", "tram", "unknown"), np.zeros((3, inputs)), np.log([0.9, 0.05, 0.05])),
+        np.array([0.9, 0.05, 0.05]),
+    )
+    users = np.array(["car", "tram", "tram", "tram"])
+    names = np.array(["a", "b", "c", "d"])
+    clips = ClipNumbers(np.zeros((40, inputs)), np.repeat(np.arange(4), 10), users, names, users)
+    found = judged(clips, shipped.guard, model)
+    expected = -(0.25 * np.log(0.25) + 0.75 * np.log(0.75))
+    assert found["kinds_log_loss"] == pytest.approx(expected)
+    assert found["kinds_log_loss_prior"] == pytest.approx(expected)
+    assert found["said_90"]["share"] == 0.0
+    strange = ClipNumbers(clips.measures, clips.clip, users, names, np.array(["ufo"] * 4))
+    with pytest.raises(InvalidArgumentError, match="ufo"):
+        judged(strange, shipped.guard, model)
