@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +26,12 @@ from worldstate_lab.evaluation.protocols import (
 )
 from worldstate_lab.evaluation.scores import Score
 from worldstate_lab.methods.acoustic_rules import CalibratedCue, PublishedRule
-from worldstate_lab.streets.simulated_windows import simulated_window_pair
 from worldstate_lab.trials import pass_cache
 from worldstate_lab.trials.classification import (
     Classifiers,
     classified,
     junction_of,
     posteriors,
-    windows_from_simulation,
     windows_from_table,
 )
 from worldstate_lab.trials.listening import pass_time_s
@@ -42,7 +41,7 @@ from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
 from worldstate.abduction.signature.site_estimate import SiteSignature
 from worldstate.adapters.datasets.feature_table import FeatureTable, write_features
 from worldstate.adapters.files.array_file import write_array_xml
-from worldstate.adapters.files.model_file import read_model, save_model
+from worldstate.adapters.files.model_file import read_model
 from worldstate.frontend.array.microphone_array import MicrophoneArray, ovad_array
 from worldstate.ground.errors import InvalidArgumentError, OutOfDomainError
 from worldstate.operations.recordings.hop_table import ABSENT, HopTable
@@ -108,13 +107,10 @@ def streets() -> list[Trial]:
     return heard + [calm(i, rng, false_alarms=(20, 50) if i < 5 else ()) for i in range(10)]
 
 
-def asked(method, trials: Sequence[Trial], seed: int = 0) -> list[Decisions]:
+def asked(method, trials: Sequence[Trial]) -> Sequence[Decisions]:
     """Return the decisions of a method on every trial, fitted to the other folds."""
-    rng, said = np.random.default_rng(seed), {}
-    for calibration, tested in STATIC.parts(trials, rng):
-        decide = method.fit([trials[i] for i in calibration], rng)
-        said |= {i: decide(trials[i]) for i in tested}
-    return [said[i] for i in range(len(trials))]
+    (said,) = run_protocol(STATIC, trials, [method], None, (0,)).decisions[method.name]
+    return said
 
 
 def figures(method, trials: Sequence[Trial]) -> dict[str, float]:
@@ -171,27 +167,11 @@ def test_calibration_recordings_are_not_tested(kinds, seed):
 
 @pytest.mark.parametrize("protocol", PROTOCOLS, ids=lambda one: one.name)
 def test_a_protocol_lists_missing_data(protocol):
-    enough = [
-        Take(Path(f"{i}"), f"{i}", site, label, 5.0, protocol.moving)
-        for i, (site, label) in enumerate(
-            [("SA1", "left"), ("SA1", "none"), ("SB1", "left"), ("SB1", "none")]
-        )
-    ]
+    kinds = product(("SA1", "SB1"), ("left", "none"))
+    enough = [Take(Path(site), site, site, label, 5.0, protocol.moving) for site, label in kinds]
     assert protocol.lacks(enough) is None
     assert "2 approaches with a T0, found 1" in (protocol.lacks(enough[1:]) or "")
     assert "found 0" in (protocol.lacks([replace(one, moving=not protocol.moving) for one in enough]) or "")
-
-
-@pytest.mark.long
-def test_the_same_seed_gives_the_same_decisions_and_another_seed_other_folds(streets):
-    few = [*streets[:2], *streets[10:12]]
-    one, again = (
-        run_protocol(STATIC, few, [SUSTAINED], Classifiers(None), (1,)).decisions["sustained"][0]
-        for _ in range(2)
-    )
-    assert all(np.array_equal(a.score, b.score) for a, b in zip(one, again, strict=True))
-    dealt = [list(STATIC.parts(streets, np.random.default_rng(seed))) for seed in (1, 1, 2)]
-    assert dealt[0] == dealt[1] != dealt[2]
 
 
 def test_figures_of_few_recordings_come_with_a_caution(streets):
@@ -218,11 +198,8 @@ def test_another_classifier_is_applied_to_the_cached_features(streets):
 
 def table_of(trials: Sequence[Trial]) -> FeatureTable:
     """Return a table with one window of each recording."""
-    columns = [
-        np.array(column)
-        for column in zip(*((t.hops.features[0], t.label, t.name, t.site) for t in trials), strict=True)
-    ]
-    features, labels, names, sites = columns
+    rows = ((t.hops.features[0], t.label, t.name, t.site) for t in trials)
+    features, labels, names, sites = map(np.array, zip(*rows, strict=True))
     return FeatureTable(features, labels, names, sites, names, (None,) * len(names))
 
 
@@ -234,41 +211,9 @@ def test_windows_of_a_test_recording_are_left_out_or_rejected(streets, tmp_path)
     assert "9 of test recordings left out" in said
     with pytest.raises(InvalidArgumentError, match="left03"):
         Classifiers(table_of(streets)).classify("all", streets[:3], streets[3:4], 1)
-
-
-@pytest.mark.slow
-def test_simulated_training_windows_are_kept_and_are_of_other_recordings(tmp_path):
-    first, said = windows_from_simulation(tmp_path, 1, per_approach=1, sites=("SA1",))
-    (path,) = tmp_path.iterdir()
-    written = path.stat().st_mtime_ns
-    again, _ = windows_from_simulation(tmp_path, 1, per_approach=1, sites=("SA1",))
-    assert path.stat().st_mtime_ns == written
-    assert np.array_equal(first.features, again.features)
-    of_the_seed, _ = simulated_window_pair(1, 1, sites=("SA1",))
-    assert not np.isclose(first.features[:, None, 0], of_the_seed.features[None, :, 0]).any()
-    assert "other recordings" in said
-
-
-@pytest.mark.long
-def test_another_model_runs_only_its_own_chain(tmp_path):
-    """Results of the front-end come from the cache; only the chain of the other model is run."""
-    sound = tmp_path / "quiet.wav"
-    rng = np.random.default_rng(0)
-    # With a source ahead: on microphone noise alone every model is at its limit of certainty.
-    noise = 0.01 * (rng.standard_normal((75_000, 56)) + rng.standard_normal((75_000, 1)))
-    soundfile.write(sound, noise, 48_000, subtype="FLOAT")
-    write_array_xml(tmp_path / "array.xml", ovad_array())
-    model = read_model()
-    signature = replace(model.signature, experts=model.signature.experts[:1])
-    save_model(tmp_path / "other.json", replace(model, signature=signature))
-    take, cache = Take(sound, "quiet", "quiet"), tmp_path / "cache"
-    heard = Hearer(cache)(take)
-    measured = {path: path.stat().st_mtime_ns for path in (cache / "front_end").iterdir()}
-    other = Hearer(cache, tmp_path / "other.json")(take)
-    assert {path: path.stat().st_mtime_ns for path in (cache / "front_end").iterdir()} == measured
-    assert len(list((cache / "plain").glob("*.npz"))) == 2
-    assert np.array_equal(heard.hops.features, other.hops.features)
-    assert not np.array_equal(heard.hops.shipped, other.hops.shipped)
+    write_array_xml(tmp_path / "array.xml", MicrophoneArray(ovad_array().positions_m[::7], "ring"))
+    with pytest.raises(OutOfDomainError, match=r"windows of another array.*extract-features"):
+        windows_from_table(tmp_path / "windows.csv", TakeList(tmp_path, (), (), (), False))
 
 
 def test_another_model_of_a_moving_ego_processes_its_drives_again(tmp_path, monkeypatch):
@@ -303,13 +248,6 @@ def test_a_model_is_not_scored_on_sound_outside_its_domain(microphones, rate_hz,
     assert not rows & set(refused)
 
 
-def test_windows_of_another_array_are_rejected(streets, tmp_path):
-    write_array_xml(tmp_path / "array.xml", MicrophoneArray(ovad_array().positions_m[::7], "ring"))
-    write_features(tmp_path / "windows.csv", table_of(streets))
-    with pytest.raises(OutOfDomainError, match=r"windows of another array.*extract-features"):
-        windows_from_table(tmp_path / "windows.csv", TakeList(tmp_path, (), (), (), False))
-
-
 def test_unreadable_recordings_are_listed_if_too_few_remain():
     takes = tuple(Take(Path(kind), kind, "SA1", kind, 5.0) for kind in ("left", "none"))
     with pytest.raises(InvalidArgumentError, match=r"found 1 .*; not processed: right: cut short"):
@@ -329,7 +267,7 @@ def test_the_pass_is_extrapolated_with_constant_speed(last_s):
 def test_front_end_figures_of_streets_with_known_results(streets):
     study = front_end_study(streets, np.random.default_rng(0), draws=40)
     found = study.figures
-    assert found["bearing_srp_deg"] == pytest.approx(3.0)
+    assert [found[f"bearing_{of}_deg"] for of in ("srp", "gated")] == pytest.approx([3.0, 3.0])
     assert found["bearing_music_deg"] == pytest.approx(7.0)
     assert found["prominence_in_view"] == pytest.approx(1.6)
     assert found["prominence_in_silence"] == pytest.approx(1.0)
@@ -339,23 +277,6 @@ def test_front_end_figures_of_streets_with_known_results(streets):
     assert study.frames == 10 * int((streets[0].hops.time_s > T0_S + 1e-6).sum())
     low, high = study.intervals["looming_auroc"]
     assert low <= found["looming_auroc"] <= high
-
-
-def test_bearings_of_all_approaches_are_gated_together(streets):
-    """The most prominent bearing of both is wrong by 1 degree; a window without a box is left out."""
-    first = streets[0].hops
-    three = {name: column[:3] for name, column in first.columns.items()}
-    sure = replace(first, columns=three).replace(
-        prominence=np.full(3, 2.0), reference_rad=np.zeros(3), srp_rad=np.radians([1.0, 1, 1])
-    )
-    unsure = sure.replace(
-        prominence=np.array([1.2, 1.2, 9.0]),
-        srp_rad=np.radians([3.0, -3, 50]),
-        reference_rad=np.array([0.0, 0.0, np.nan]),
-    )
-    trials = [replace(streets[0], hops=hops) for hops in (unsure, sure)]
-    found = front_end_study(trials, np.random.default_rng(0), draws=1).figures
-    assert found["bearing_gated_deg"] == pytest.approx(1.0)
 
 
 def test_the_method_of_the_documentation_is_added_by_one_line(streets):

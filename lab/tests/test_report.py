@@ -1,9 +1,11 @@
-"""The report: complete files, external text never as markup, the paper's numbers beside ours."""
+"""The command `table` and its report: complete files, no foreign markup, the paper's numbers beside ours."""
 
 import csv
 import io
 import math
 import re
+import shutil
+import time
 from argparse import Namespace
 from dataclasses import replace
 
@@ -12,16 +14,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_evaluation import HOPS, approach, calm
+from test_hazard_awareness import RISING, counts, judged, staged
 from worldstate_lab.cli.main import keep_results, main, read_results, result_key
-from worldstate_lab.degradation.awareness import Awareness, AwarenessRow, CommonCause, Estimate
-from worldstate_lab.degradation.beta_curves import Band, BetaCurves
-from worldstate_lab.degradation.conditions import CLEAN, FAMILIES, Condition
+from worldstate_lab.degradation.beta_curves import beta_curves
 from worldstate_lab.degradation.degradation_study import DegradationSettings, DegradationStudy, DetectorSweep
 from worldstate_lab.evaluation.evaluation import Evaluation, EvaluationSettings
 from worldstate_lab.evaluation.figures import PAPER_VALUES, paper_value
 from worldstate_lab.evaluation.front_end_study import front_end_study
-from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, ProtocolRun
-from worldstate_lab.evaluation.report.approach_panel import approach_figure
+from worldstate_lab.evaluation.protocols import DYNAMIC, FIXED, RETRAINED, STATIC, run_protocol
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.panels import roc_curve
 from worldstate_lab.evaluation.scores import Score
@@ -38,11 +38,9 @@ from worldstate_lab.report.table import (
     markdown_page,
     write_document,
 )
-from worldstate_lab.trials.trial import Decisions, Take, TakeList, Trial
+from worldstate_lab.trials.trial import Take, TakeList
 
-from worldstate.ground.errors import InputFileError
 from worldstate.operations.metrics.approach_table import auroc
-from worldstate.operations.recordings.hop_table import HopTable
 
 HOSTILE = '<script src="http://x/y.js">a|b</script> `*_\n| "q" & [t](http://x)'
 
@@ -51,9 +49,9 @@ def plot(canvas):
     canvas.subplots().plot([0, 1], [1, 0])
 
 
-def small_document(text, draw=plot):
+def small_document(text):
     table = Table("t", text, (text, "v"), ((text, Value(0.5, 0.4, 0.6, note=text, paper=Value(1.0))),), text)
-    figure = Figure("f", text, text, draw, ("x", text), [(0.1, text)])
+    figure = Figure("f", text, text, plot, ("x", text), [(0.1, text)])
     return Document(text, text, (Section(text, (text,), (table, figure)),), ((text, text),))
 
 
@@ -81,43 +79,11 @@ def test_a_missing_value_has_a_reason_and_minus_zero_is_never_printed():
     assert Value(1.0, math.nan, 2.0).text == "1.00"
 
 
-def test_a_failed_picture_leaves_the_last_report_unchanged(tmp_path):
-    write_document(small_document("first"), tmp_path)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-
-    def fail(canvas):
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        write_document(small_document("second", fail), tmp_path)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-    assert sorted(path.name for path in tmp_path.rglob("*")) == [
-        "f.csv", "f.png", "report.md", "report_files", "t.csv",
-    ]  # fmt: skip
-
-
-def test_a_file_of_the_user_is_not_mistaken_for_an_old_report(tmp_path):
-    (tmp_path / "report_files").write_text("mine")
-    with pytest.raises(InputFileError, match="earlier report"):
-        write_document(small_document("x"), tmp_path)
-    assert (tmp_path / "report_files").read_text() == "mine"
-
-
-def test_numbers_of_the_paper_agree_with_each_other():
-    def of(row, figure, group="static"):
-        return paper_value(group, row, figure).value
-
-    rate, sustained = (of(row, "false_alarms_per_hour") for row in ("proposed .02", "published, sustained"))
-    assert 1.0 - rate / sustained == pytest.approx(
-        of("against the sustained rule", "fewer_false_alarms"), abs=0.005
-    )
-    assert 1.0 / of("proposed .02", "hazard_free_hours") == pytest.approx(9.7, abs=0.05)
-    # Onsets are whole numbers: every rate of the static set is a multiple of the quantum, up to rounding.
-    for one in PAPER_VALUES:
-        if one.figure == "false_alarms_per_hour" and one.group == "static":
-            onsets = one.value * of("proposed .02", "hazard_free_hours")
-            assert onsets == pytest.approx(round(onsets), abs=0.06), one
-    assert of("proposed .02", "detection") * 42 == pytest.approx(37, abs=0.05)
+def test_rates_of_the_paper_are_whole_numbers_of_onsets_in_its_hours():
+    hours = paper_value("static", "proposed .02", "hazard_free_hours").value
+    rates = [one for one in PAPER_VALUES if (one.figure, one.group) == ("false_alarms_per_hour", "static")]
+    for one in rates:
+        assert one.value * hours == pytest.approx(round(one.value * hours), abs=0.06), one
     assert len({(one.group, one.row, one.figure) for one in PAPER_VALUES}) == len(PAPER_VALUES)
 
 
@@ -139,43 +105,27 @@ METHODS = (
 )
 
 
-def run_of(protocol, trials):
-    """Return the result of `run_protocol` without a classifier: the trials already contain its posteriors."""
-    said = {method.name: {} for method in METHODS}
-    for calibration, tested in protocol.parts(trials, np.random.default_rng(0)):
-        for method in METHODS:
-            decide = method.fit([trials[i] for i in calibration], np.random.default_rng(0))
-            said[method.name] |= {i: decide(trials[i]) for i in tested}
-    passes = {name: (tuple(one[i] for i in range(len(trials))),) for name, one in said.items()}
-    return ProtocolRun(protocol, tuple(trials), passes, (0,), "all")
-
-
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
     rng, burst = np.random.default_rng(0), tuple(range(20, 27))
     made = [(f"{i}", approach(i, rng, lead_s=2.0)) for i in range(8)]
     made += [(f"none{i}", calm(i, rng, false_alarms=burst if i % 3 else ())) for i in range(8)]
-    trials = [
-        replace(
-            one, hops=one.hops.replace(name=name, about={**one.hops.about, "site": ("SA1", "SB1")[i % 2]})
-        )
-        for i, (name, one) in enumerate(made)
-    ]
+    trials = []
+    for i, (name, one) in enumerate(made):
+        about = {**one.hops.about, "site": ("SA1", "SB1")[i % 2]}
+        trials.append(replace(one, hops=one.hops.replace(name=name, about=about)))
     root = tmp_path_factory.mktemp("streets")
     takes = TakeList(root, tuple(Take(root / t.name, t.name, t.site, t.label) for t in trials), (), (), False)
-    runs = {one.name: run_of(one, trials) for one in (STATIC, FIXED)}
-    scores = {
-        name: {m: Score.of(run.trials, p) for m, p in run.decisions.items()} for name, run in runs.items()
-    }
-    rng = np.random.default_rng(0)
-    draws = {
-        name: stratified_draws([(t.label, t.site) for t in run.trials], rng, 50) for name, run in runs.items()
-    }
+    draws = stratified_draws([(t.label, t.site) for t in trials], rng, 50)
+    runs, scores = {}, {}
+    for one in (STATIC, FIXED):
+        run = runs[one.name] = run_protocol(one, trials, METHODS, None, (0,))
+        scores[one.name] = {name: Score.of(trials, passes) for name, passes in run.decisions.items()}
     lacking = {one.name: "needs more" for one in (DYNAMIC, RETRAINED)}
-    study = front_end_study(trials, rng, 20)
     return Evaluation(
-        takes, tuple(trials), (), lacking, runs, scores, draws, study, None, EvaluationSettings(draws=50)
-    )
+        takes, tuple(trials), (), lacking, runs, scores, dict.fromkeys(runs, draws),
+        front_end_study(trials, rng, 20), None, EvaluationSettings(draws=50),
+    )  # fmt: skip
 
 
 @pytest.mark.long
@@ -210,7 +160,7 @@ def test_every_table_states_its_data_and_every_mean_its_worst_junction(evaluatio
     blocks = {block.name: block for block in evaluation_document(evaluation).blocks}
     hours = 8 * HOPS * 0.1 / 3600.0
     told = f"16 recordings: 8 approaches and 8 hazard-free, {hours:.3f} h."
-    assert {"table_i", "equal_detection", "calibration", "protocol_junctions_fixed"} <= {
+    assert {"table_i", "calibration", "protocol_junctions_fixed"} <= {
         name for name, block in blocks.items() if block.caption.startswith(told)
     }
     assert {row[2] for row in blocks["junctions"].rows} == {"8"}
@@ -241,59 +191,21 @@ def test_a_model_outside_its_domain_has_rows_without_numbers(evaluation, tmp_pat
     assert "&lt;b>: not the array of the model" in (tmp_path / "report.md").read_text("utf-8")
 
 
-def test_the_boxes_of_one_image_are_counted_at_its_hop():
-    times = 1.0 + 0.1 * np.arange(20)
-    boxes = HopTable({"time_s": np.array([0.5, 2.0, 2.01]), "moving": np.ones(3, bool)})
-    said = Decisions.of(times, times > 1.5, score=np.linspace(0, 1, 20), threshold=np.array([0.5]))
-    figure = approach_figure("a", Trial(HopTable({"time_s": times}, "a", "left", 1.9), boxes), said, ())
-    # The boxes of one image are counted at its hop, each once.
-    assert sum(row[3] for row in figure.rows) == 2
-
-
-def degradation(detectors):
-    """Return a sweep in which beta is 0.1 per level and awareness is 0.98 minus 0.01 per level."""
-    shape = (len(FAMILIES), 5)
-    overall = np.broadcast_to(0.05 + 0.1 * np.arange(5), shape)
-    wide = np.broadcast_to(overall[:, None], (shape[0], 3, shape[1]))
-    by_azimuth = wide + np.array([0.0, 0.01, 0.02])[:, None]
-    conditions = [Condition(CLEAN), *(Condition(f, level) for f in FAMILIES for level in range(1, 5))]
-    rows = tuple(
-        AwarenessRow(
-            one, one.degradation, 0.1, Estimate(0.95 - 0.1 * one.level, 0.4, 1.0), 0.9,
-            Estimate(0.98 - 0.01 * one.level, 0.9, 1.0), None, 0.8, None,
-            Estimate(10.0, 1.0, 40.0), Estimate(10.0, 1.0, 40.0), 0.1,
-        )
-        for one in conditions
-    )  # fmt: skip
-    half = Estimate(0.5, 0.4, 0.6)
-    sweeps = tuple(
-        DetectorSweep(
-            name,
-            BetaCurves(
-                (0.0, 10.0, 20.0, 36.0), np.full(by_azimuth.shape, 30.0), Band(*[by_azimuth] * 3),
-                Band(*[overall] * 3), (),
-            ),
-            Awareness(rows, (CommonCause(1, 6.0, half, half, half, half, half),), 100, 0.03),
-        )
-        for name in detectors
-    )  # fmt: skip
-    return DegradationStudy(sweeps, ("a", "b"), ("c", "d"), {}, (), DegradationSettings())
-
-
 @pytest.mark.long
 def test_every_detector_of_a_sweep_gets_panels_and_tables_of_its_own(evaluation, tmp_path):
-    document = evaluation_document(replace(evaluation, degradation=degradation(("first", "<b>second"))))
-    names = [block.name for block in document.blocks]
-    assert len(set(names)) == len(names)
-    assert {"cueing_awareness_1", "cueing_awareness_2", "degradation_2", "rain_2"} <= set(names)
-    paper = {row[2]: row[3:6] for block in document.blocks if block.name == "paper" for row in block.rows}
-    least, _, found = paper["after line-of-sight entry: least hazard awareness"]
-    assert (least.value, found.value) == (0.87, pytest.approx(0.94))
-    _, _, found = paper["miss rate of the camera: clean, 20 to 30 deg"]
-    assert found.value == pytest.approx(0.07)
-    (panel,) = (block for block in document.blocks if block.name == "cueing_awareness_1")
-    (worst,) = ((row[2], row[3].value) for row in panel.rows if row[0] == "blur" and row[1] == 4)
-    assert worst == pytest.approx((0.45, 0.94))
+    rng = np.random.default_rng(0)
+    found = judged([staged(i, i % 2 == 0, rng) for i in range(12)])
+    curves = beta_curves([counts(RISING)] * 3, stratified_draws([0] * 3, rng))
+    sweeps = tuple(DetectorSweep(name, curves, found) for name in ("first", "<b>second"))
+    study = DegradationStudy(sweeps, ("a", "b"), ("c", "d"), {}, (), DegradationSettings())
+    document = evaluation_document(replace(evaluation, degradation=study))
+    blocks = {block.name: block for block in document.blocks}
+    assert len(blocks) == len(document.blocks)
+    assert {"cueing_awareness_1", "cueing_awareness_2", "degradation_2", "rain_2"} <= set(blocks)
+    paper = {row[2]: row[3:6] for row in blocks["paper"].rows}
+    least, _, ours = paper["after line-of-sight entry: least hazard awareness"]
+    assert (least.value, ours.value) == (0.87, sweeps[0].least_awareness.awareness.value)
+    assert paper["miss rate of the camera: clean, 20 to 30 deg"][2].value == pytest.approx(RISING[2][0] / 40)
     write_document(document, tmp_path)
     assert "<b>second" not in (tmp_path / "report.md").read_text(encoding="utf-8")
 
@@ -304,10 +216,7 @@ def test_results_are_merged_by_the_arguments_that_change_a_figure(tmp_path, caps
         given = Namespace(seed=3, smoke="--smoke" in words)
         keep_results(path, words, given, {"beta": np.array([0.1, np.nan])})
     found = read_results(path)
-    assert {key: one["smoke"] for key, one in found.items()} == {
-        "bench --seed 3": False,
-        "bench --smoke": True,
-    }
+    assert [*found] == ["bench --seed 3", "bench --smoke"] and found["bench --smoke"]["smoke"]
     assert found["bench --seed 3"]["figures"] == {"beta": [0.1, None]}
     assert found["bench --seed 3"]["seeds"] == [3] and "commit" in found["bench --seed 3"]
     for name in ("a.npz", "b.npz"):
@@ -318,3 +227,38 @@ def test_results_are_merged_by_the_arguments_that_change_a_figure(tmp_path, caps
     path.write_text("{")
     assert main(["place", "none.csv", "--results", str(path)]) == 2
     assert "results of worldstate-lab: expected JSON" in capsys.readouterr().err
+
+
+BLIND = "Vision-only", "Radar field-of-view model", "OC-SORT recovery (stock)"
+TABLE_ONE = {
+    *("OC-SORT recovery (coasting)", "published", "published, sustained", "proposed .01", "proposed .02"),
+    *("proposed .05", "proposed .02 + looming", "with absence .02", "shipped model", "+ site adaptation"),
+    "world-state advisory",
+}
+
+
+def test_every_row_of_the_table_is_there(smoke):
+    _, report = smoke
+    rows = report["protocols"]["static"]
+    assert {*BLIND, *TABLE_ONE} <= set(rows)
+    # Methods that need a line of sight have no alarm before T0.
+    assert [rows[name]["detection"] for name in BLIND] == [0.0, 0.0, 0.0]
+    assert set(report["protocols"]) == {"static", "junctions_fixed", "junctions_retrained"}
+    assert "dynamic" in report["lacking"] and "moving ego" in report["lacking"]["dynamic"]
+    assert "SIMULATED" in report["data"]
+    # Two recordings of either kind are too few, and the report states this.
+    assert len(report["cautions"]["static"]) == 2
+
+
+def test_partial_data_are_rejected_with_a_list(smoke, tmp_path, capsys):
+    out, _ = smoke
+    broken = tmp_path / "broken"
+    shutil.copytree(out / "smoke", broken, ignore=shutil.ignore_patterns("out_multi.wav"))
+    started = time.monotonic()
+    assert main(["table", str(broken), "--out", str(tmp_path / "no")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("out_multi.wav") == 4 and "4 required items are missing" in said
+    assert main(["table", str(tmp_path), "--out", str(tmp_path / "no")]) == 2
+    assert "DataLog.csv" in capsys.readouterr().err
+    assert time.monotonic() - started < 10.0
+    assert not (tmp_path / "no" / "cache").exists()
