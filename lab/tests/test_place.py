@@ -8,31 +8,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
-from worldstate_lab.cli.place import WALLS, followed_places, place_models, simulated_pass
 from worldstate_lab.places.place_filter import PlaceBelief, PlaceFilter, added_position
 from worldstate_lab.places.spectrum_model import SpectrumModel, StreetWalls, sound_paths
 
 from worldstate.frontend import MicrophoneArray
-from worldstate.ground.errors import InvalidArgumentError
 
 AZIMUTHS = np.radians(np.linspace(90.0, -90.0, 61))
 HZ = np.arange(200.0, 2000.0, 300.0)
 ROWS = [[x, y, 0.0] for x in (-0.2, 0.0, 0.2) for y in (-0.3, -0.1, 0.1, 0.3)]
 
 
-def model_of(left_m: float, right_m: float, facing_m: float | None = 9.9) -> SpectrumModel:
-    walls = StreetWalls(4.45, left_m, right_m, 7.15, facing_m)
-    return SpectrumModel.of(walls, MicrophoneArray(np.array(ROWS)), AZIMUTHS, HZ, draws=8)
-
-
-MODEL = model_of(2.8, 2.8)
+ARRAY = MicrophoneArray(np.array(ROWS))
+MODEL = SpectrumModel.of(StreetWalls(4.45, 2.8, 2.8, 7.15, 9.9), ARRAY, AZIMUTHS, HZ, draws=8)
 PLACES = PlaceFilter(MODEL)
 
 
 def plane_waves(*azimuths_deg: float) -> np.ndarray:
-    array = MicrophoneArray(np.array(ROWS))
-    beams = array.steering(HZ, AZIMUTHS).conj().transpose(0, 2, 1)
-    return (np.abs(beams @ array.steering(HZ, np.radians(azimuths_deg))) ** 2).sum(axis=(0, 2))
+    beams = ARRAY.steering(HZ, AZIMUTHS).conj().transpose(0, 2, 1)
+    return (np.abs(beams @ ARRAY.steering(HZ, np.radians(azimuths_deg))) ** 2).sum(axis=(0, 2))
 
 
 @pytest.mark.parametrize(
@@ -74,28 +67,12 @@ def test_scale_and_offset_of_a_spectrum_have_no_effect(scale: float, offset: flo
     assert np.isfinite(like).all() and nobody > 0.0
 
 
-def test_a_mirrored_street_mirrors_the_likelihood() -> None:
-    spectrum = np.random.default_rng(3).normal(size=len(AZIMUTHS))
-    even, mirrored = model_of(2.0, 3.5), model_of(3.5, 2.0)
-    # Draws give the left and the right wall different factors; exchanging them gives the same street.
-    like = np.mean(even.heard_share, axis=0)
-    assert np.mean(mirrored.heard_share, axis=0)[::-1] == pytest.approx(like, abs=0.05)
-    found, other = even.log_likelihood(spectrum)[0], mirrored.log_likelihood(spectrum[::-1])[0]
-    assert np.corrcoef(found, other[::-1])[0, 1] > 0.9
-
-
 def test_a_vehicle_in_view_is_where_its_bearing_meets_the_lane() -> None:
     for azimuth_deg in (-25.0, -10.0, 15.0):
         like, nobody = MODEL.log_likelihood(plane_waves(azimuth_deg))
         along_m = 7.15 * np.tan(np.radians(azimuth_deg))
         assert MODEL.along_m[like.argmax()] == pytest.approx(along_m, abs=1.5)
         assert like.max() > nobody
-
-
-@pytest.mark.parametrize("bad", [np.zeros(61), np.zeros(60), np.full(61, np.nan)])
-def test_a_constant_spectrum_is_rejected(bad: np.ndarray) -> None:
-    with pytest.raises(InvalidArgumentError, match="spectrum"):
-        MODEL.log_likelihood(bad)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 2.0))
@@ -112,12 +89,11 @@ def test_a_prediction_moves_the_mean_by_its_speed() -> None:
     sharp = np.full_like(PLACES.unknown.log_present, -700.0)
     speed = 15 + 6
     sharp[speed, np.abs(MODEL.along_m + 5.0).argmin()] = 0.0
-    belief = PlaceBelief(sharp, -700.0)
-    for _ in range(10):
-        belief = PLACES.predict(belief, 0.1)
-    assert PLACES.estimate(belief).mean_m == pytest.approx(-1.0, abs=0.05)
-    at_once = PLACES.predict(PlaceBelief(sharp, -700.0), 1.0)
-    assert PLACES.estimate(at_once).mean_m == pytest.approx(-1.0, abs=0.05)
+    for steps in (1, 10):
+        belief = PlaceBelief(sharp, -700.0)
+        for _ in range(steps):
+            belief = PLACES.predict(belief, 1.0 / steps)
+        assert PLACES.estimate(belief).mean_m == pytest.approx(-1.0, abs=0.05)
 
 
 def test_the_added_position_completes_the_prior_belief() -> None:
@@ -127,10 +103,8 @@ def test_the_added_position_completes_the_prior_belief() -> None:
         carried = PLACES.predict(carried, 0.1)
     now, before = PLACES.estimate(belief), PLACES.estimate(carried)
     assert now.stated and not before.stated
-    # The first second alone nearly gives the belief, because nothing was known before.
     first = added_position(now, before, MODEL.walls.crossing_m)
     assert first is not None
-    assert first.position_m[1] == pytest.approx(now.mean_m, abs=2.0)
     assert first.position_m[1] > MODEL.walls.sight_m[1]
     # Both together give the belief again.
     weights = 1.0 / first.covariance[1][1], before.std_m**-2
@@ -144,17 +118,3 @@ def test_the_example_gives_an_entity_its_position() -> None:
     (car,) = example["behind_the_corner"](25).entities
     assert car.status == "hidden" and car.direction == "left"
     assert car.position_m[1] == pytest.approx(7.0, abs=2.0)
-
-
-@pytest.mark.slow
-def test_a_simulated_pass_is_tracked_around_the_corner() -> None:
-    models = place_models()
-    for seed, site in enumerate(WALLS):
-        _, table = simulated_pass(site, np.random.default_rng([9, seed]))
-        said = followed_places(PlaceFilter(models[site]), table)
-        right, left = WALLS[site].sight_m
-        hidden = (table.along_m < right) | (table.along_m > left)
-        sides = np.array([one.left_probability > 0.5 for one in said])
-        assert np.mean(sides[hidden] == (table.along_m[hidden] > 0.0)) > 0.9
-        errors = np.array([one.mean_m for one in said]) - table.along_m
-        assert np.sqrt(np.mean(errors[~hidden] ** 2)) < 2.0

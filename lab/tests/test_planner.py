@@ -8,14 +8,7 @@ import pytest
 from hop_tables import heard_stream
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binomtest
-from worldstate_lab.planner.encounters import (
-    FROM_STANDING,
-    STEP_S,
-    BelievedStream,
-    EgoVehicle,
-    with_chances,
-)
+from worldstate_lab.planner.encounters import FROM_STANDING, STEP_S, BelievedStream, EgoVehicle, with_chances
 from worldstate_lab.planner.planner_exam import (
     CHANCE,
     FULL,
@@ -30,8 +23,6 @@ from worldstate_lab.planner.planner_exam import (
     unseen_from_m,
 )
 
-from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.approach_table import share_interval
 from worldstate.simulation.scene.junction import site
 
 PACE_MPS, ENTRY_Y_M, ENTRIES_S = 4.5, 4.0, (40.0, 80.0, 120.0, 160.0)
@@ -116,18 +107,3 @@ def test_no_car_brakes_or_accelerates_beyond_its_limits(seed: int, threshold: fl
     assert change.min() >= -ego.full_mps2 - 1e-6 and change.max() <= ego.acceleration_mps2 + 1e-6
     always = drive_through(told, 0.0, ego)
     np.testing.assert_array_equal(always.front_m, drive_through(corners.loud, 0.0, ego).front_m)
-
-
-def test_streams_without_the_requested_encounters_are_rejected() -> None:
-    with pytest.raises(InvalidArgumentError, match="60 replays of approaches"):
-        draw_corners([EVERY[2]], 60, EgoVehicle(), np.random.default_rng(0))
-    with pytest.raises(InvalidArgumentError, match="60 times without vehicles"):
-        draw_corners([EVERY[0]], 60, EgoVehicle(), np.random.default_rng(0))
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(1, 2000), st.floats(0.0, 1.0))
-def test_the_interval_of_a_share_is_that_of_clopper_and_pearson(of: int, share: float) -> None:
-    count = round(share * of)
-    exact = binomtest(count, of).proportion_ci(0.95, "exact")
-    assert share_interval(count, of) == pytest.approx((exact.low, exact.high), abs=1e-9)

@@ -4,8 +4,6 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.optimize import minimize
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
@@ -16,8 +14,6 @@ from worldstate.abduction.evidence import abduce, statistic
 from worldstate.abduction.signature.ensemble import mirror_features
 from worldstate.abduction.signature.published_signature import PAIRS, SignatureModel, couple
 from worldstate.abduction.signature.window_classes import CLASSES, hazard_statistic
-from worldstate.adapters.files.model_file import read_model
-from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.serialisation import decode, encode
 
 
@@ -69,23 +65,6 @@ def test_with_libsvm_s_sigmoids_only_its_tolerance_is_left(trained, libsvm):
     np.testing.assert_allclose(same.predict_proba(X), machine.predict_proba(scaler.transform(X)), atol=5e-3)
 
 
-def test_decision_values_are_those_of_the_machine(trained, libsvm):
-    scaler, machine = libsvm
-    machine.decision_function_shape = "ovo"
-    oracle = machine.decision_function(scaler.transform(trained[0]))
-    np.testing.assert_allclose(trained[2].decision_values(trained[0]), oracle, atol=1e-9)
-
-
-weights = st.lists(st.floats(1e-3, 1), min_size=4, max_size=4)
-
-
-@given(weights)
-def test_consistent_pairs_give_back_their_probabilities(values):
-    p = np.array(values) / np.sum(values)
-    pairs = np.array([[p[i] / (p[i] + p[j]) for i, j in PAIRS]])
-    np.testing.assert_allclose(couple(pairs, 4)[0], p, atol=1e-6)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_coupling_minimises_its_criterion(seed):
     pairs = np.random.default_rng(seed).uniform(0.02, 0.98, 6)
@@ -128,35 +107,3 @@ def test_the_mirror_swaps_sides_and_is_its_own_inverse():
     assert (labels == "left").sum() == (labels == "right").sum() == hazards.sum()
     first = features[len(y)].reshape(2, 30)
     np.testing.assert_array_equal(first, X[hazards][0].reshape(2, 30)[:, ::-1])
-
-
-def test_the_same_seed_gives_the_same_model():
-    X, y = windows(np.random.default_rng(4))
-    first, second = (PublishedClassifier(np.random.default_rng(5)).fit(X, y).model_ for _ in range(2))
-    assert encode(first) == encode(second)
-
-
-def test_constant_features_are_harmless():
-    X, y = windows(np.random.default_rng(6))
-    X[:, 5] = X[:, 24] = 0.3
-    assert np.isfinite(PublishedClassifier(np.random.default_rng(0)).fit(X, y).predict_proba(X)).all()
-
-
-def test_likelihoods_are_finite_far_from_the_training_data():
-    model = read_model().signature
-    for level in (-1e6, 0.0, 1.0, 1e6):
-        assert np.isfinite(model.evidence(np.full(60, level)).log_likelihoods).all()
-
-
-@pytest.mark.parametrize("X", [np.zeros((3, 59)), np.zeros(60), np.full((1, 60), np.nan)])
-def test_other_features_are_rejected(X):
-    with pytest.raises(InvalidArgumentError, match="X"):
-        read_model().signature.predict_proba(X)
-
-
-@pytest.mark.parametrize(
-    "labels", [["left", "right"] * 20, ["left", "none"] * 20, ["front", "none", "left", "up"] * 10]
-)
-def test_training_needs_its_classes(labels):
-    with pytest.raises(InvalidArgumentError, match="classes"):
-        PublishedClassifier(np.random.default_rng(0)).fit(np.zeros((40, 60)), labels)
