@@ -1,8 +1,10 @@
 """Recordings and decisions with known figures: 0.1-s hops from the first second on."""
 
 import numpy as np
+import soundfile
 from worldstate_lab.trials.trial import BOX_COLUMNS, TRACK_COLUMNS, TRUTH_COLUMNS, Decisions, Trial
 
+from worldstate.ground.errors import InputFileError
 from worldstate.operations.recordings.hop_table import HopTable
 
 
@@ -65,3 +67,12 @@ def tracked(trial, there, names, azimuth_rad):
     """Return tracks with at most one per hop."""
     rows = zip(trial.hops.time_s[there], names[there], azimuth_rad[there], strict=True)
     return HopTable.of_rows(TRACK_COLUMNS, rows)
+
+
+def gram(path):
+    """Return products of the channels of a sound file, which several BLAS threads may compute."""
+    try:
+        sound, _ = soundfile.read(path)
+    except soundfile.LibsndfileError as error:
+        raise InputFileError(path, "expected a sound file") from error
+    return sound.T @ sound

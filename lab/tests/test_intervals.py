@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import bootstrap, poisson
+from scipy.stats import binomtest, bootstrap, poisson
 from worldstate_lab.metrics.intervals import (
     deal_folds,
     middle,
@@ -16,7 +16,7 @@ from worldstate_lab.metrics.intervals import (
 )
 
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.operations.metrics.approach_table import poisson_interval
+from worldstate.operations.metrics.approach_table import poisson_interval, share_interval
 
 few = settings(max_examples=40)
 
@@ -28,10 +28,7 @@ def test_the_interval_of_a_rate_contains_the_likely_counts(count, hours, confide
     tail = (1 - confidence) / 2
     assert poisson.cdf(count, high * hours) == pytest.approx(tail, rel=1e-6)
     assert low == 0 if count == 0 else poisson.sf(count - 1, low * hours) == pytest.approx(tail, rel=1e-6)
-
-
-@pytest.mark.parametrize(("count", "hours"), [(0, 1.0), (7, 0.5), (40, 3.0)])
-def test_a_rate_at_its_upper_bound_gives_so_few_counts_once_in_ten(count, hours):
+    # A rate at its upper bound gives so few counts once in ten.
     assert poisson.cdf(count, poisson_upper(count, hours) * hours) == pytest.approx(0.1, rel=1e-6)
 
 
@@ -39,6 +36,14 @@ def test_a_rate_at_its_upper_bound_gives_so_few_counts_once_in_ten(count, hours)
 def test_a_rate_without_time_or_with_a_negative_count_is_rejected(arguments):
     with pytest.raises(InvalidArgumentError):
         poisson_interval(*arguments)
+
+
+@given(st.integers(1, 2000), st.floats(0.0, 1.0))
+@settings(max_examples=20)
+def test_the_interval_of_a_share_is_that_of_clopper_and_pearson(of, share):
+    count = round(share * of)
+    exact = binomtest(count, of).proportion_ci(0.95, "exact")
+    assert share_interval(count, of) == pytest.approx((exact.low, exact.high), abs=1e-9)
 
 
 @given(st.lists(st.floats(0, 20), min_size=1, max_size=5), st.integers(0, 30), st.integers(0, 2**32))
@@ -50,9 +55,6 @@ def test_the_random_detection_rate_equals_that_of_drawn_alarms(windows, alarms, 
     hit = ((onsets < ends) & (onsets >= ends - windows)).any(axis=1)
     # Four standard errors of a mean of draws, each in [0, 1].
     assert random_detection(windows, alarms, total) == pytest.approx(hit.mean(), abs=4 * 0.5 / draws**0.5)
-
-
-def test_without_an_approach_random_alarms_detect_nothing():
     assert np.isnan(random_detection([], 3, 10.0))
 
 
