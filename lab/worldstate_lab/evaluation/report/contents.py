@@ -13,12 +13,12 @@ from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
 from worldstate_lab.evaluation.protocols import PROTOCOLS, STANDING, Protocol
-from worldstate_lab.report.table import Cell, Document, Section, Table, Value
+from worldstate_lab.report.table import Cell, Document, Section, Table
 from worldstate_lab.trials.pass_cache import data_fingerprint
 
 from .degradation_section import awareness_figures, degradation_section, sweep_values
 from .measured_values import PROPOSED, MeasuredValues, printed, site_values
-from .warning_sections import cueing_section, table_i, tracking_section
+from .warning_sections import cueing_section, table_i
 
 _TRANSFER = (
     *("detection", "lead_s", "false_alarms_per_hour", "random_detection", "auroc_all", "ece"),
@@ -40,25 +40,6 @@ def _label(one: PaperValue) -> str:
     # Without the unit.
     title = FIGURES[one.figure].title if one.figure in FIGURES else one.figure.replace("_", " ")
     return f"{one.row}: {title.partition(' (')[0]}"
-
-
-def front_end_section(measured: MeasuredValues) -> Section:
-    """Return the section on bearing errors against the camera by junction."""
-    study = measured.found.front_end
-    if study is None:
-        return Section("Front-end accuracy", ("No recording has a camera reference.",))
-    sites = Table(
-        "bearing_by_junction",
-        "Bearing error by junction",
-        ("junction", "median error (deg)", "hops"),
-        [
-            (site, Value(one.median_deg, *one.interval_deg, digits=1), str(one.frames))
-            for site, one in study.by_site.items()
-        ],
-        "SRP-PHAT bearing against the nearest moving box of the camera, hops after T0. The paper's medians "
-        "lie between 2.5 and 5.8 degrees.",
-    )
-    return Section("Front-end accuracy", (), (sites,))
 
 
 def transfer_section(measured: MeasuredValues) -> Section:
@@ -128,10 +109,8 @@ def evaluation_document(found: Evaluation, configuration: Sequence[tuple[str, st
     sections = [
         _data_section(found),
         *((table_i(measured), cueing_section(measured, panels)) if static else ()),
-        front_end_section(measured),
         transfer_section(measured),
         degradation_section(found.degradation, found.lacking.get("degradation sweep", "not requested")),
-        *((tracking_section(measured),) if static else ()),
         paper_section(measured),
     ]
     return Document(
