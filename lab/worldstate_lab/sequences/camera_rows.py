@@ -19,11 +19,7 @@ from worldstate.operations.metrics.approach_table import (
     rising_edges,
 )
 from worldstate.operations.recordings.hop_table import HopTable
-from worldstate_lab.evaluation.ablation_rows import (
-    AblationSwitches,
-    ablation_table,
-    evaluate_ablation,
-)
+from worldstate_lab.evaluation.ablation_rows import AblationSwitches, ablation_table, evaluate_ablation
 from worldstate_lab.metrics.intervals import deal_folds, middle, pooled_share, stratified_draws
 from worldstate_lab.trials.pass_cache import ALPHA
 

@@ -4,10 +4,9 @@ Blur, darkness, noise and a wet lens (blur and darkness together, without drops)
 the videos of a folder, and a detector runs on them: NanoDet on three crops of every second image, or the
 project's motion detector on every image. Boxes are kept in DIR/DETECTOR-FAMILY-LEVEL/ID.json and reused.
 
-The output has the scores and heights of NanoDet that were tried on the clean boxes, with each junction left
-out; the miss rate beta of the reference vehicle after T0 by state and angle; and the share of images after T0
-with a detected moving vehicle, beside that of hazard-free images. `--timeline ID` draws one approach into
-DIR; its images must not be published.
+The output has the miss rate beta of the reference vehicle after T0 by state (and, printed, by angle), and the
+share of images after T0 with a detected moving vehicle, beside that of hazard-free images. `--timeline ID`
+draws one approach into DIR; its images must not be published.
 
 Examples
 --------
@@ -42,19 +41,13 @@ from worldstate_lab.report.table import Cell, Table, Value, plain
 from worldstate_lab.sequences.hearing import heard, ovad_chain
 from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
 from worldstate_lab.sequences.staged_looks import (
-    BoxChoice,
     VisionRow,
-    box_choices,
-    left_out_choices,
     staged_beta,
     staged_miss_rates,
     vision_row,
-    watched_images,
 )
 from worldstate_lab.sequences.staged_video import Staging, milliseconds_a_search, stage_recording, staging_of
 from worldstate_lab.trials.trial import Decisions, Trial
-
-_PRINTED_CHOICES = 10
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +69,6 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         return CommandResult({"figure": str(_timeline(arguments, recordings))})
     staging = staging_of(arguments.detector, arguments.folder, arguments.out, arguments.seed)
     _stage(staging, recordings, arguments.jobs)
-    choice, choice_tables = _choice(recordings)
     approaches = [one for one in recordings if not one.hazard_free]
     draws = stratified_draws([one.junction for one in approaches], np.random.default_rng(arguments.seed))
     curves = staged_beta(staging, approaches, draws)
@@ -85,11 +77,10 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     rows = [vision_row(staging, state, recordings, draws) for state in staging.states]
     report = {
         "recordings": len(recordings),
-        "choice": choice,
         "beta": _beta_report(curves),
         "vision": {one.state: one for one in rows},
     }
-    tables = [*choice_tables, *_beta_tables(curves), _vision_table(rows)]
+    tables = [*_beta_tables(curves), _vision_table(rows)]
     lines = [line for one in tables for line in ("", *one.lines())]
     return CommandResult(plain(report), table={}, lines=lines)
 
@@ -106,41 +97,13 @@ def _stage(staging: Staging, recordings: Sequence[CornerRecording], jobs: int) -
         list(track(in_processes(partial(stage_recording, staging), missing, jobs), told, len(missing)))
 
 
-def _choice(recordings: Sequence[CornerRecording]) -> tuple[dict[str, Any], list[Table]]:
-    watched = [watched_images(one) for one in recordings]
-    tried, left_out = box_choices(watched), left_out_choices(watched)
-    columns = "least score", "least height (px)", "found", "hazard-free", "gain"
-    shown = [_choice_row(one) for one in tried[:_PRINTED_CHOICES]]
-    others: list[tuple[Cell, ...]] = [(junction, *_choice_row(one)) for junction, one in left_out.items()]
-    title = f"Minimum score and height, the best {len(shown)} of {len(tried)}"
-    at = "Choice without a junction, and its shares there"
-    tables = [Table("choice", title, columns, shown), Table("left_out", at, ("junction", *columns), others)]
-    return {"tried": tried, "left_out": left_out}, tables
-
-
-def _choice_row(one: BoxChoice) -> tuple[float, ...]:
-    return one.min_score, one.min_height_px, one.found, one.false, one.gain
-
-
 def _beta_report(curves: BetaCurves) -> dict[str, Any]:
-    """Return beta by family, angle and level, and how often it falls with the level."""
+    """Return beta by family and level over all angles."""
     levels = range(curves.looks.shape[2])
-    falls = {
-        along: [one for one in curves.falls if one.along == along] for along in ("degradation", "azimuth")
-    }
-    counted = {
-        along: {"count": len(some), "certain": sum(one.certain for one in some)}
-        for along, some in falls.items()
-    }
-    by_angle = {
-        family: {name: [_beta(curves, i, b, level) for level in levels] for b, name in enumerate(curves.bins)}
-        for i, family in enumerate(FAMILIES)
-    }
     overall = {
         family: [_beta(curves, i, None, level) for level in levels] for i, family in enumerate(FAMILIES)
     }
-    looks = dict(zip(curves.bins, curves.looks[0, :, 0].tolist(), strict=True))
-    return {"by_angle": by_angle, "overall": overall, "looks": looks, "falls": counted}
+    return {"overall": overall}
 
 
 def _beta(curves: BetaCurves, family: int, azimuth: int | None, level: int) -> Value:
