@@ -104,7 +104,6 @@ class FollowedStream:
     masked: BoolArray  # shape (n,): Whether the snapshot gives a reason for reduced audibility
     unheard: BoolArray  # shape (n,): Whether the snapshot marks the hop as inaudible
     entities: tuple[tuple[Entity, ...], ...]  # Entities of every hop
-    merged: frozenset[str]  # Identifiers of entities merged into another one
     tallies: tuple[Tally, ...]  # Counts of the watch over the alarm's budget, at every hop
 
     def hidden(self, hop: int, side: int, least: float = 0.0) -> list[Entity]:
@@ -151,7 +150,6 @@ def followed(
         masked=np.array([any(one.reason for one in state.heard or ()) for state in states]),
         unheard=np.array([all(one.share < LEAST_HEARD for one in state.heard or ()) for state in states]),
         entities=tuple(state.entities for state in states),
-        merged=frozenset(one.entity_id for state in states for one in state.events if one.kind == "merged"),
         tallies=tuple(Tally() if state.budget is None else state.budget.tally for state in states),
     )
 

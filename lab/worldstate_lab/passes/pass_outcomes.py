@@ -22,8 +22,8 @@ from itertools import chain, product
 import numpy as np
 from scipy.signal import lfilter, sosfilt
 
-from worldstate.abduction.cueing.risk_map import brier_skill, expected_calibration_error
-from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S, LONGEST_S
+from worldstate.abduction.cueing.risk_map import expected_calibration_error
+from worldstate.abduction.sequence.sequence_model import COMING_S, HORIZONS_S
 from worldstate.commissioning.alarm_curve import measured_curve, raised_at
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.commissioning.sequence_training import QUIET_KINDS
@@ -165,7 +165,6 @@ def _entities(streams: Sequence[PassedStream], table: ApproachTable) -> Figures:
                 third.append(len({e.id for at in sides for e in followed.hidden(*at, EXISTS)}) > 2)
     judged = [one for one in kept if one is not None]
     return {
-        "onsets_per_approach": mean_of([one.onsets for one in table.outcomes if one.detected]),
         "phantom_third": mean_of(third),
         "identity_judged": len(judged),
         "identity_kept": mean_of(judged),
@@ -232,14 +231,13 @@ def _hops_beside(
 
 
 def _kept(streams: Sequence[PassedStream]) -> Figures:
-    """Return how often an entity is near a vehicle in the 3 s after T0, and how many entities are."""
-    near = []
+    """Return how often an entity is near a vehicle in the 3 s after T0."""
+    near = list[bool]()
     for stream, one, hop, azimuth in _hops_beside(streams, 0.0, KEPT_S):
         if one.flow == "single":
             there = [e for e in stream.followed.entities[hop] if e.existence_probability >= EXISTS]
-            near.append(sum(abs(wrap_angle(e.azimuth_rad - azimuth)) <= KEPT_RAD for e in there))
-    counts = np.array(near)
-    return {"kept_after_t0": mean_of(counts > 0), "entities_after_t0": mean_of(counts[counts > 0])}
+            near.append(any(abs(wrap_angle(e.azimuth_rad - azimuth)) <= KEPT_RAD for e in there))
+    return {"kept_after_t0": mean_of(near)}
 
 
 def _forecast(streams: Sequence[PassedStream]) -> Figures:
@@ -251,10 +249,8 @@ def _forecast(streams: Sequence[PassedStream]) -> Figures:
     return {
         **chance_figures(within[said], coming_s[said]),
         # The risk is that of a hidden vehicle coming into view within the horizon of the sequence model.
-        "risk_skill": brier_skill(risk, coming_s <= HORIZON_S),
         "risk_ece": expected_calibration_error(risk, coming_s <= HORIZON_S),
         **time_figures(stated, coming_s),
-        "times_stated": mean_of(np.isfinite(stated[coming_s <= LONGEST_S][:, 1])),
     }
 
 
@@ -357,9 +353,10 @@ def second_figures(streams: Sequence[PassedStream]) -> Figures:
     for (behind, side), (gap, (low, high)) in product(enumerate(SIDES_OF), GAPS_S.items()):
         here = (hops.behind == behind) & (hops.gap_s >= low) & (hops.gap_s < high)
         mine = [row[2:] for row in kept if row[0] == behind and low <= row[1] < high]
-        same, merged = ([row[i] for row in mine if row[0]] for i in (1, 2))
-        figures = {"approaches": len(mine)} | _noticed(hops, here & heard) | _masked(hops, here & ~heard)
-        figures |= {"stated apart": len(same), "identity kept": mean_of(same), "merged": mean_of(merged)}
+        same = [kept for apart, kept in mine if apart]
+        figures = {"approaches": len(mine)} | _noticed(hops, here & heard)
+        figures |= {"said masked": _said_masked(hops, here & ~heard)}
+        figures |= {"stated apart": len(same), "identity kept": mean_of(same)}
         found |= {f"{side}, {gap}: {name}": value for name, value in figures.items()}
     return found
 
@@ -373,16 +370,11 @@ def _noticed(hops: HopTable, mine: BoolArray) -> Figures:
     return {"hops of 1 dB": int(mine.sum()), "skill": float(1.0 - brier / constant) if constant else None}
 
 
-def _masked(hops: HopTable, mine: BoolArray) -> Figures:
-    """Return the calibration of chances if it adds less, and how often `heard` gives a reason."""
-    names = ("stated", "true", "ECE", "said masked")
+def _said_masked(hops: HopTable, mine: BoolArray) -> float | None:
+    """Return how often `heard` gives a reason if the second vehicle adds less than a decibel."""
     if not mine.any():
-        return dict.fromkeys(names)
-    weight = _with_empty(hops, mine)
-    bins = np.minimum(10.0 * hops.chance, 9.0).astype(np.intp)
-    error = np.abs(np.bincount(bins, weight * (hops.chance - hops.comes))).sum() / weight.sum()
-    stated, true, masked = (np.average(one, weights=weight) for one in (hops.chance, hops.comes, hops.masked))
-    return dict(zip(names, map(float, (stated, true, error, masked)), strict=True))
+        return None
+    return float(np.average(hops.masked, weights=_with_empty(hops, mine)))
 
 
 def _with_empty(hops: HopTable, mine: BoolArray) -> FloatArray:
@@ -393,10 +385,10 @@ def _with_empty(hops: HopTable, mine: BoolArray) -> FloatArray:
     return np.where(pair, mine, (some / np.maximum(every, 1))[key])
 
 
-def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool, bool]]:
-    """Yield side and gap of second vehicles, and three flags on the entity published before the first T0.
+def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool]]:
+    """Yield side and gap of second vehicles, and two flags on the entity published before the first T0.
 
-    The flags are: it existed, it is visible at the vehicle's position, it became that of the first vehicle.
+    The flags are: it existed, and it is visible at the vehicle's position.
     """
     followed = stream.followed
     for one in (one for one in _loud(stream) if len(one.entries_s) > 1):
@@ -406,9 +398,8 @@ def _kept_apart(stream: PassedStream) -> Iterator[tuple[bool, float, bool, bool,
         # vehicle's too. If both vehicles come from one side, the likeliest entity belongs to the first.
         hidden = sorted(followed.hidden(before, one.sides[1], STATED), key=lambda e: -e.existence_probability)
         stated = {e.id for e in hidden[behind:]}
-        first, second = (_seen_after(stream, entry_s) for entry_s in one.entries_s)
-        merged = first in stated or bool(stated & followed.merged)
-        yield behind, one.entries_s[1] - one.entries_s[0], bool(stated), second in stated, merged
+        second = _seen_after(stream, one.entries_s[1])
+        yield behind, one.entries_s[1] - one.entries_s[0], bool(stated), second in stated
 
 
 def _seen_after(stream: PassedStream, entry_s: float) -> str | None:
