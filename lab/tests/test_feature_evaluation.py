@@ -12,8 +12,7 @@ from scipy.special import expit, logit
 from sklearn.metrics import roc_auc_score
 from worldstate_lab.cli.main import main as lab
 from worldstate_lab.cli.windows import comparison, run_passes
-from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate, matched_risk
-from worldstate_lab.features.methods import methods
+from worldstate_lab.features.feature_evaluation import WindowMethod, cross_validate, matched_risk, methods
 from worldstate_lab.features.published_classifier import PublishedClassifier
 
 from worldstate.abduction.cueing.risk_map import fit_platt

@@ -6,8 +6,7 @@ from released_data import FOLDER, needs_released_windows
 from released_data import TABLE as NAME
 from scipy.stats import binom
 from worldstate_lab.cli.windows import comparison, report, run_passes
-from worldstate_lab.features.feature_evaluation import check_unseen, predict_held_out
-from worldstate_lab.features.methods import row_of
+from worldstate_lab.features.feature_evaluation import check_unseen, predict_held_out, row_of
 
 from worldstate.adapters.datasets.feature_table import read_features, read_ids
 from worldstate.adapters.files.model_file import read_model

@@ -50,8 +50,15 @@ from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc, mean_of
-from worldstate_lab.features.feature_evaluation import Predictions, Protocol, evaluate_pass, predict_held_out
-from worldstate_lab.features.methods import methods, row_of, rows_beside
+from worldstate_lab.features.feature_evaluation import (
+    Predictions,
+    Protocol,
+    evaluate_pass,
+    methods,
+    predict_held_out,
+    row_of,
+    rows_beside,
+)
 from worldstate_lab.metrics.intervals import (
     DRAWS,
     auroc_by_group,

@@ -17,7 +17,7 @@ from worldstate.frontend.bounds.cramer_rao import bearing_crb_rad2, endfire_info
 from worldstate.ground.checks import finite_array
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import AnyArray, FloatArray, IndexArray
-from worldstate_lab.features.methods import method_of
+from worldstate_lab.features.feature_evaluation import method_of
 from worldstate_lab.metrics.intervals import pooled_draws
 
 # Estimators use nats, the paper and the report bits.

@@ -242,8 +242,3 @@ def hear(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
     """Return the trials in the order of the recordings, and the failed recordings."""
     every = list(heard)
     return [one for one in every if isinstance(one, Trial)], [one for one in every if isinstance(one, Failed)]
-
-
-def data_fingerprint(trials: Sequence[Trial]) -> str:
-    """Return a hash of 32 characters of the content of all recordings of an evaluation."""
-    return origin_of(sorted((trial.name, trial.hops.about["fingerprint"]) for trial in trials))

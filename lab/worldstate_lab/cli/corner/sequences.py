@@ -37,13 +37,13 @@ from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate_lab.report.table import plain
-from worldstate_lab.sequences.front_end_figures import front_end_figures
 from worldstate_lab.sequences.hearing import PAIR, SPECTRA, Chain, PathName, corner_chain
 from worldstate_lab.sequences.path_figures import (
     SEEDS,
     Heard,
     classifiers_of,
     exam_figures,
+    front_end_figures,
     heard_every_way,
     path_figures,
     score_figures,

@@ -1,20 +1,14 @@
 """The report of an evaluation: its sections in order, the sections after the warnings, and the data used."""
 
-import platform
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-
-import numpy as np
-import scipy
-import sklearn
 
 from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
 from worldstate_lab.evaluation.protocols import PROTOCOLS, STANDING, Protocol
 from worldstate_lab.report.table import Cell, Document, Section, Table
-from worldstate_lab.trials.pass_cache import data_fingerprint
 
 from .degradation_section import awareness_figures, degradation_section, sweep_values
 from .measured_values import PROPOSED, MeasuredValues, printed, site_values
@@ -165,18 +159,9 @@ def _protocol_row(found: Evaluation, protocol: Protocol) -> tuple[Cell, ...]:
 
 
 def _facts(found: Evaluation) -> tuple[tuple[str, str], ...]:
-    settings = found.settings
-    versions: Sequence[tuple[str, str]] = (
-        ("worldstate", __version__),
-        ("Python", platform.python_version()),
-        ("numpy", np.__version__),
-        ("scipy", scipy.__version__),
-        ("scikit-learn", sklearn.__version__),
-    )
     return (
-        *versions,
+        ("worldstate", __version__),
         ("data", found.takes.origin),
-        ("fingerprint of the data", data_fingerprint(found.trials) if found.trials else "none"),
-        ("seeds of the folds", ", ".join(map(str, settings.seeds))),
-        ("draws of recordings for intervals", str(settings.draws)),
+        ("seeds of the folds", ", ".join(map(str, found.settings.seeds))),
+        ("draws of recordings for intervals", str(found.settings.draws)),
     )
