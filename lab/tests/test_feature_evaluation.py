@@ -149,23 +149,25 @@ def test_every_figure_can_be_recomputed_from_the_predictions(protocol):
     figures = comparison(table, passes, "baseline", draws=2)
     scored = table.labels != "front"
     hazard = table.labels[scored] != "none"
-    accuracy, areas, rates = [], [], []
+    accuracy, areas, by_junction, rates = [], [], [], []
     for one in passes["baseline"]:
         _, left, _, right = one.probabilities.T
         likeliest = np.array(CLASSES)[np.argmax(one.probabilities, axis=1)]
         accuracy.append(np.mean(likeliest == table.labels))
         areas.append(roc_auc_score(hazard, one.score[scored]))
+        here = [scored & (table.environments == site) for site in JUNCTIONS]
+        by_junction.append([roc_auc_score(table.hazards[rows], one.score[rows]) for rows in here])
         rates.append((one.decision[scored][hazard].mean(), one.decision[scored][~hazard].mean()))
         np.testing.assert_allclose(one.score, left + right, atol=1e-9)
     assert figures["accuracy"] == pytest.approx(np.mean(accuracy))
     assert figures["auroc_pooled"] == pytest.approx(np.mean(areas))
     assert (figures["tpr"], figures["fpr"]) == pytest.approx(tuple(np.mean(rates, axis=0)))
-    by_junction = [group["auroc"] for group in figures["per_group"].values()]
     assert figures["auroc_macro"] == pytest.approx(np.mean(by_junction))
+    assert figures["worst_group_auroc"] == pytest.approx(np.mean(np.min(by_junction, axis=1)))
 
 
 @pytest.mark.long
-def test_the_same_command_prints_the_same_with_every_junction(csv_path, capsys):
+def test_the_same_command_prints_the_same(csv_path, capsys):
     outputs = []
     for form in ("--json", "--json", "--seeds=1"):
         assert command("windows", csv_path, "--method", "baseline", "--seeds", 1, form) == 0
@@ -174,7 +176,7 @@ def test_the_same_command_prints_the_same_with_every_junction(csv_path, capsys):
     figures = json.loads(outputs[0])
     for key, (low, high) in figures["intervals"].items():
         assert low <= high and (key == "ece" or low - 1e-9 <= figures[key] <= high + 1e-9)
-    assert all(junction in outputs[2] for junction in JUNCTIONS)
+    assert "worst_group_auroc" in outputs[2]
 
 
 @pytest.mark.long

@@ -73,8 +73,6 @@ class GuardShares:
     hops: int
     foreign: float  # Share classified as foreign
     signal: float  # Share classified as a warning signal
-    # Smallest share over sites that is not classified as the street; for a street the largest
-    worst_site: float
 
 
 def guard_exam(rows: SoundRows, advance: Callable[[], object] = lambda: None) -> list[GuardShares]:
@@ -89,16 +87,12 @@ def guard_exam(rows: SoundRows, advance: Callable[[], object] = lambda: None) ->
 
 def _shares(rows: SoundRows, verdicts: FloatArray, without: str, kind: str) -> GuardShares:
     here = rows.kinds == kind
-    by_site = [
-        float((verdicts[here & (rows.sites == one)] > 0).mean()) for one in np.unique(rows.sites[here])
-    ]
     return GuardShares(
         without=without,
         kind=kind,
         hops=int(here.sum()),
         foreign=float((verdicts[here] == _FOREIGN).mean()),
         signal=float((verdicts[here] == _SIGNAL).mean()),
-        worst_site=max(by_site) if kind in STREET else min(by_site),
     )
 
 
@@ -159,7 +153,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     rows = SoundRows.joined([rows, of_guard(close_rows(GUARD_RATE_HZ, rng, CLIPS_EACH))])
     with progress_bar("training guards", len(EXAMS)) as bar:
         found = guard_exam(rows, bar.advance)
-    heads = ("guard without", "kind", "hops", "foreign", "signal", "worst site")
+    heads = ("guard without", "kind", "hops", "foreign", "signal")
     lines = Table("guards", "", heads, [astuple(one) for one in found]).lines()[1:]
     report = {"sites": sites, "seed": arguments.seed, "rows": [asdict(one) for one in found]}
     return CommandResult(report, table={}, lines=lines)

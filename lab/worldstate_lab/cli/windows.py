@@ -48,7 +48,7 @@ from worldstate.cli.common.progress import progress_bar
 from worldstate.cli.model.fit import add_table_options, read_beside
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
+from worldstate.ground.typing import FloatArray, IndexArray
 from worldstate.operations.metrics.approach_table import auroc, mean_of
 from worldstate_lab.features.feature_evaluation import (
     Predictions,
@@ -110,21 +110,9 @@ def _figures_on(table: FeatureTable, one: Predictions) -> Callable[[IndexArray],
     return figures
 
 
-def _group_figures(table: FeatureTable, predictions: Predictions, here: BoolArray) -> Figures:
-    """Return accuracy, area and rates of one junction; None if a label is missing there."""
-    scored = here & (table.hazards | table.hazard_free)
-    return {
-        "accuracy": mean_of((predictions.classes == table.labels)[here]),
-        "auroc": auroc(predictions.score[scored], table.hazards[scored]),
-        "tpr": mean_of(predictions.decision[here & table.hazards]),
-        "fpr": mean_of(predictions.decision[here & table.hazard_free]),
-    }
-
-
 def report(table: FeatureTable, predictions: Predictions) -> dict[str, Any]:
-    """Return the figures of one pass, counts, and the figures of each junction."""
-    figures = window_figures(table, predictions)
-    return {**figures, **count_windows(table), "per_group": report_groups(table, [predictions])}
+    """Return the figures of one pass, and counts."""
+    return {**window_figures(table, predictions), **count_windows(table)}
 
 
 def count_windows(table: FeatureTable) -> dict[str, int]:
@@ -149,16 +137,6 @@ def mean_figures(figures: Sequence[Figures]) -> Figures:
         key: mean_of([value for figure in figures if (value := figure[key]) is not None])
         for key in figures[0]
     }
-
-
-def report_groups(table: FeatureTable, passes: Sequence[Predictions]) -> dict[str, Figures]:
-    """Return the figures of each junction, mean over the passes, with its number of windows."""
-    figures: dict[str, Figures] = {}
-    for environment in np.unique(table.environments).tolist():
-        here = table.environments == environment
-        means = mean_figures([_group_figures(table, one, here) for one in passes])
-        figures[environment] = {"n_windows": int(here.sum()), **means}
-    return figures
 
 
 # The same samples for every method and run, so that differences between methods are paired.
@@ -234,7 +212,6 @@ def comparison(
     return {
         **rows[row],
         **count_windows(table),
-        "per_group": report_groups(table, passes[row]),
         "rows": {name: rows[name] for name in others},
         "gains": {
             name: {
@@ -320,14 +297,11 @@ def _passes(
 
 
 def _flat(figures: Mapping[str, Any]) -> dict[str, object]:
-    """Return one line per junction and per compared row, as text."""
+    """Return one line per figure and per compared row, as text."""
     flat = {key: value for key, value in figures.items() if not isinstance(value, dict)}
     intervals = figures.get("intervals", {})
     for key, (low, high) in intervals.items():
         flat[key] = f"{figures[key]:.4g}  [{low:.4g}, {high:.4g}]"
-    for environment, values in figures["per_group"].items():
-        known = [f"{key} {value:.3g}" for key, value in values.items() if value is not None]
-        flat[environment] = "  ".join(known)
     for row, gains in figures.get("gains", {}).items():
         flat[f"gain over {row}"] = "  ".join(
             f"{key} {gain['gain']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"

@@ -183,7 +183,7 @@ def _decision(trial: Trial) -> FloatArray:
 
 _risk, _compared = attrgetter("hops.risk"), attrgetter("hops.compared_nats")
 PRODUCT = "product, with camera"
-DECISION, DECISION_SEEN = "decision value, sound alone", "decision value, with camera"
+DECISION = "decision value, sound alone"
 SCORES = (
     HopScore("window alone", False, _window, _ratios),
     HopScore("window and absence", True, _unseen, _ratios),
@@ -191,7 +191,7 @@ SCORES = (
     HopScore("product, sound alone", False, _risk),
     HopScore(PRODUCT, True, _risk),
     HopScore(DECISION, False, _decision),
-    HopScore(DECISION_SEEN, True, _decision),
+    HopScore("decision value, with camera", True, _decision),
     HopScore("compared value, sound alone", False, _compared),
     HopScore("compared value, with camera", True, _compared),
     HopScore("side ratio", False, _ratios),
@@ -213,8 +213,6 @@ def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dic
         "rows": _rows(run, path, rng),
         "leads": scores[PRODUCT]["leads"],
         "at_onsets": scores[DECISION]["at_onsets"],
-        "at_onsets_with_camera": scores[DECISION_SEEN]["at_onsets"],
-        "at_false_recordings": scores[DECISION]["at_false_recordings"],
         **_window_figures(run, _SHIPPED, rng),
         "published": _window_figures(run, _PUBLISHED, rng) if _PUBLISHED in run.decisions else None,
         "calibration": calibration(path.seen, rng),

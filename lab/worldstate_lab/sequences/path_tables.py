@@ -31,9 +31,8 @@ def _tables(path: str, found: Mapping[str, Any]) -> Iterator[Table]:
     counted = f"boxes from {NANODET_BOXES.min_score} and {NANODET_BOXES.min_height_px:g} px up"
     untouched = f"alarms; thresholds from five folds, those of the product unchanged; {counted}"
     yield alarm_table(found["rows"], "alarm", untouched, exam)
-    for name, key in (("sound alone", "at_onsets"), ("with the camera", "at_onsets_with_camera")):
-        yield alarm_table(found[key], "onsets <=", f"curve: decision value, {name}, swept afterwards")
-    yield alarm_table(found["at_false_recordings"], "in alarm <=", "curve: the same by recordings in alarm")
+    swept = "curve: decision value, sound alone, swept afterwards"
+    yield alarm_table(found["at_onsets"], "onsets <=", swept)
     yield scores_table(found["scores"], "parts of the product, thresholds swept afterwards")
 
 
