@@ -6,23 +6,18 @@ from dataclasses import replace
 
 from worldstate.ground.version import __version__
 from worldstate_lab.evaluation.evaluation import Evaluation
-from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue, titles
+from worldstate_lab.evaluation.figures import COMMANDS, FIGURES, PAPER_VALUES, PaperValue
 from worldstate_lab.evaluation.protocols import PROTOCOLS, STANDING, Protocol
 from worldstate_lab.report.table import Cell, Document, Section, Table
 
 from .degradation_section import awareness_figures, degradation_section, sweep_values
-from .measured_values import PROPOSED, MeasuredValues, printed, site_values
+from .measured_values import MeasuredValues, printed
 from .warning_sections import cueing_section, table_i
 
 _TRANSFER = (
     *("detection", "lead_s", "false_alarms_per_hour", "random_detection", "auroc_all", "ece"),
     "side_correct",
 )
-_BY_SITE = (
-    *("hazard_free_hours", "detection", "random_detection", "lead_s", "false_alarms_per_hour", "auroc_all"),
-)
-
-
 # Groups of the paper's values whose row names are complete labels.
 _NAMED_BY_ROW = ("array bounds", "signature study", "data", "real time")
 
@@ -37,31 +32,14 @@ def _label(one: PaperValue) -> str:
 
 
 def transfer_section(measured: MeasuredValues) -> Section:
-    """Return the section on protocols other than the static folds, with every junction of all protocols."""
+    """Return the section on protocols other than the static folds."""
     tables = []
     for name, run in measured.found.runs.items():
         if name != STANDING:
             told = f"Published classifier trained on: {run.trained_on}. Intervals as in Table I."
             of = f"protocol_{name}", run.protocol.title, told
             tables.append(measured.table(name, measured.methods(name), _TRANSFER, *of))
-    return Section("Generalisation", (), (*tables, _junction_table(measured.found)))
-
-
-def _junction_table(found: Evaluation) -> Table:
-    """Return the results of the proposed method at every junction, by protocol."""
-    rows: list[tuple[Cell, ...]] = []
-    for name, run in found.runs.items():
-        counts = Counter(trial.site for trial in run.trials)
-        for site, one in site_values(found.scores[name][PROPOSED], found, name).items():
-            rows.append((run.protocol.title, site, str(counts[site]), *map(one.get, _BY_SITE)))
-    return Table(
-        "junctions",
-        f"Every junction, {PROPOSED}",
-        ("protocol", "junction", "recordings", *titles(_BY_SITE)),
-        rows,
-        "Intervals over the recordings of the junction. A junction has few recordings, so one alarm is a "
-        "high rate per hour.",
-    )
+    return Section("Generalisation", (), tuple(tables))
 
 
 def paper_section(measured: MeasuredValues) -> Section:
