@@ -25,7 +25,7 @@ def compared(group, protocol, row, others=(), seeds=1):
     return comparison(table, passes, row, draws=60)
 
 
-# Least values of our method, and the standard deviations by which the calibration error may exceed its floor.
+# Least values of our method; the calibration error may exceed its floor by this many standard deviations.
 # Three of five junctions with a moving ego are available: classifiers trained on two are overconfident.
 LEAST = [
     pytest.param(

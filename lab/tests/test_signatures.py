@@ -2,6 +2,8 @@
 
 import csv
 import json
+import re
+from pathlib import Path
 from zlib import crc32
 
 import numpy as np
@@ -32,9 +34,10 @@ from worldstate_lab.signatures.traffic_clips import (
 
 from worldstate.abduction.road_users import RoadUserModel
 from worldstate.adapters.files.model_file import read_model
-from worldstate.ground.errors import InvalidArgumentError
+from worldstate.ground.errors import InputFileError, InvalidArgumentError
 
 RATE_HZ = 24_000
+REAL = Path(__file__).parents[3] / "shared" / "real-sounds"
 CAR = "2019-10-22-08-40_Fraunhofer-IDMT_30Kmh_1272258_M_D_CR"
 EMPTY = "2019-11-19-13-10_Langewiesener-Strasse_unknownKmh_10077440"
 IDMT_NAMES = [f"{CAR}_ME_CH12", f"{CAR}_SE_CH34", f"{EMPTY}_SE_CH34-BG", f"{EMPTY}_ME_CH12-BG"]
@@ -79,6 +82,13 @@ def test_idmt_clips_have_the_labels_of_their_names(tmp_path):
     assert labels[0].recording == labels[1].recording != labels[2].recording == labels[3].recording
     samples, rate_hz = read_clip(clips[0])
     assert (samples.shape, rate_hz) == ((16_000, 2), 8000.0)
+
+
+@pytest.mark.parametrize("lost", ["annotation/eusipco_2021_test.txt", f"audio/{IDMT_NAMES[1]}.wav"])
+def test_a_partial_folder_is_rejected_with_the_missing_files(tmp_path, lost):
+    (write_idmt(tmp_path / "corpus") / lost).rename(tmp_path / "elsewhere")
+    with pytest.raises(InputFileError, match=f"missing: {re.escape(lost)}"):
+        idmt_traffic(tmp_path / "corpus")
 
 
 def test_the_profile_is_welchs_t_squared_over_n_and_finds_the_band_of_vehicle_sound():
@@ -212,3 +222,25 @@ def test_probabilities_are_corrected_to_the_shares_of_the_table():
     strange = ClipNumbers(clips.measures, clips.clip, users, names, np.array(["ufo"] * 4))
     with pytest.raises(InvalidArgumentError, match="ufo"):
         judged(strange, shipped.guard, model)
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="real sounds are beside the repository only")
+def test_real_vehicles_are_familiar_and_trams_are_not_trucks(tmp_path):
+    rows = list(csv.DictReader((REAL / "clips.csv").open()))
+    known = {"car", "tram"}
+    said = [(r["sound"], r["kind"], r["recording"], r["kind"] if r["kind"] in known else "") for r in rows]
+    path = tmp_path / "clips.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("file", "kind", "recording", "road_user"), *said])
+    clips = read_clips(path, REAL / "numbers.npz")
+    model = read_model()
+    assert model.guard is not None and model.road_users is not None
+    found = judged(clips, model.guard, model.road_users)
+    kinds = found["kinds"]
+    assert max(kinds[name]["foreign"] for name in known) <= 0.05
+    assert kinds["engine_idling"]["foreign"] <= 0.2
+    for name in ("dog_bark", "children_playing", "street_music", "gun_shot"):
+        assert kinds[name]["familiar"] <= 0.25
+    assert kinds["siren"]["signal"] >= 0.6
+    assert found["kinds_log_loss"] <= 0.8 * found["kinds_log_loss_prior"]
+    assert found["said_90"]["right"] >= 0.85

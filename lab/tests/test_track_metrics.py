@@ -23,7 +23,7 @@ def test_gospa_is_stone_soups(seed, said, there):
     metrics = pytest.importorskip("stonesoup.metricgenerator.ospametric", reason=why)
     from stonesoup.types.state import State
 
-    assume(said or there)  # It has no distance between two empty sets
+    assume(said or there)  # Stone Soup defines no distance between two empty sets
     rng, cutoff = np.random.default_rng(seed), np.radians(60.0)
     estimates, truths = (rng.uniform(-3.5, 3.5, n) for n in (said, there))
 
