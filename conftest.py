@@ -97,6 +97,6 @@ def smoke(tmp_path_factory):
     """Return the folder of a smoke evaluation, and its report."""
 
     out = tmp_path_factory.mktemp("evaluation")
-    # Five pools would import the library in two processes each: the second run in test_evaluate uses pools.
+    # One process: five pools would import the library in two processes each.
     assert study(["table", "--smoke", "--jobs", "1", "--out", str(out)]) == 0
     return out, json.loads((out / "evaluation.json").read_text())

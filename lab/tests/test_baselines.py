@@ -84,9 +84,9 @@ def agree(images):
         lost = [track.get_state_bbox() for track in peer.tracks if track.time_since_update]
         assert len(tracks) == len(peer.tracks) and len(coasting) == len(lost)
         np.testing.assert_allclose(in_order(coasting), in_order(lost), atol=1e-6)
-        # It numbers a track when it is confirmed, we do when it starts, so identities are compared through
-        # the boxes. It counts images from the first box and returns unconfirmed tracks in one image more than
-        # the authors' code.
+        # The package numbers a track when it is confirmed, OcSort when it starts, so identities are compared
+        # through the boxes. The package counts images from the first box and returns unconfirmed tracks in
+        # one image more than the authors' code.
         boxes = found.data.get("at", np.empty(0, int))
         named = {
             int(at): int(number) for at, number in zip(boxes, found.tracker_id, strict=True) if number >= 0
