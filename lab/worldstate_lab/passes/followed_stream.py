@@ -42,8 +42,7 @@ _STILL_M = 1e-3  # Least motion per 0.1 s: slower vehicles keep their heading
 
 def stream_detections(heard: HeardStream, rng: np.random.Generator) -> DetectionLog:
     """Return the boxes of all vehicles in view, with the miss rate of the paper's detector."""
-    camera, site = PinholeCamera.ovad(), junction_named(heard.site)
-    frames: dict[int, list[Row]] = {}
+    site, frames = junction_named(heard.site), dict[int, list[Row]]()
     kinds = dict(zip(heard.vehicles.vehicle.tolist(), heard.vehicles.kind.tolist(), strict=True))
     for number, name in kinds.items():
         kind, mine = vehicle_kind(name), heard.rows.vehicle == number
@@ -51,10 +50,10 @@ def stream_detections(heard: HeardStream, rng: np.random.Generator) -> Detection
         time_s = heard.rows.time_s[mine]
         crossing = _crossing(x, y)
         for at in np.flatnonzero(seen).tolist():
-            box = _box(camera, site, kind, float(x[at]), float(y[at]), int(crossing[at]))
+            box = _box(site, kind, float(x[at]), float(y[at]), int(crossing[at]))
             if box is None or rng.random() < miss_rate(float(x[at]), float(y[at])):
                 continue
-            noisy = inside(box + rng.normal(0.0, BOX_NOISE_PX, 4), camera)
+            noisy = inside(box + rng.normal(0.0, BOX_NOISE_PX, 4))
             frame = round(float(time_s[at]) / FRAME_S)
             score = float(np.clip(rng.normal(0.95, 0.03), 0.3, 0.999))
             frames.setdefault(frame, []).append((noisy, score, kind.label))
@@ -79,17 +78,15 @@ def _crossing(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(np.where(sideways, np.sign(dy), 0.0))
 
 
-def _box(
-    camera: PinholeCamera, site: Site, kind: VehicleKind, x: float, y: float, crossing: int
-) -> FloatArray | None:
+def _box(site: Site, kind: VehicleKind, x: float, y: float, crossing: int) -> FloatArray | None:
     # Rows contain the front axle: the body extends from the bumper ahead of it to one length behind the
     # bumper.
     if crossing:
         front = y + crossing * kind.axles_m[0]
         ends = sorted((front, front - crossing * kind.length_m))
-        return project(camera, site, x, (ends[0], ends[1]), kind)
+        return project(site, x, (ends[0], ends[1]), kind)
     half = 0.5 * kind.width_m
-    return project(camera, site, x, (y - half, y + half), kind)
+    return project(site, x, (y - half, y + half), kind)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
