@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from made_up_corner import write_corner
-from test_feature_evaluation import made_up_table, write_csv
+from test_feature_evaluation import made_up_table, written
 from worldstate_lab.cli.main import main
 
 
@@ -20,7 +20,7 @@ def given(corner, tmp_path_factory):
     """Return the arguments for the windows and the recordings left out of them."""
     folder = tmp_path_factory.mktemp("windows")
     (folder / "ids.csv").write_text("ID\nnone_1\n0_left\n")
-    features = write_csv(folder / "windows.csv", made_up_table(recordings=36, spread=0.3))
+    features = written(folder / "windows.csv", made_up_table(recordings=36, spread=0.3))
     return ["junctions", str(corner), "--features", str(features), "--lists", str(folder / "ids.csv")]
 
 
