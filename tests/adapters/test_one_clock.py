@@ -185,7 +185,7 @@ def test_an_assumed_rate_must_fit_the_sound(sound, tmp_path, written, rate_hz) -
     images = round(rate_hz * LENGTH_S)
     path = written(tmp_path, images)
     if rate_hz in TEN_HZ or (written is mot_text and rate_hz < 10.0):  # Lines do not end with the images
-        assert len(heard(sound, detections=path).detections or ()) == images
+        assert len(heard(sound, 60.0, detections=path).detections or ()) == images
         return
     with pytest.raises(InputFileError, match="image_rate_hz of the camera"):
         heard(sound, detections=path)
