@@ -266,7 +266,7 @@ def test_a_scenario_counts_approaches_and_inaudible_hops_in_gusts_and_outside(se
 def test_the_hops_of_gusts_are_those_in_which_the_wind_is_loud(tmp_path: Path) -> None:
     gusty = replace(traffic_named("no-hazard-gusts"), per_hour={}, sounds={"wind": 300.0})
     plan = StreamSettings(junction_named("SB2"), 0.7, 3, gusty, sample_rate_hz=6000.0)
-    (rendered, in_gust), (again, _) = (scenarios.followed(plan, read_model(), tmp_path) for _ in range(2))
+    (rendered, in_gust), (again, _) = (scenarios.follow_plan(plan, read_model(), tmp_path) for _ in range(2))
     np.testing.assert_array_equal(rendered.followed.risk, again.followed.risk)
     assert 30 < in_gust.sum() < len(in_gust) - 30
     # Below 150 Hz there is only wind: without vehicles the level separates the hops.

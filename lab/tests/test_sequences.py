@@ -14,7 +14,7 @@ from made_up_trials import made_up
 from worldstate_lab.cli.card import with_real
 from worldstate_lab.cli.main import main, read_results
 from worldstate_lab.methods.line_of_sight import OcSortRecovery
-from worldstate_lab.sequences.path_figures import exam_figures
+from worldstate_lab.sequences.path_figures import simulated_exam
 from worldstate_lab.sequences.path_tables import alarm_table
 from worldstate_lab.sequences.recordings import NANODET_BOXES
 from worldstate_lab.sequences.scores import alarm_row, calibration, curve, leads, sweep
@@ -223,7 +223,7 @@ def test_unsuitable_options_and_recordings_are_rejected(tmp_path, capsys, words,
 def test_figures_of_the_simulated_exam_are_printed_beside_the_same_real_figures(tmp_path) -> None:
     file = tmp_path / "exam.json"
     file.write_text(json.dumps({"auroc_1s_before": 0.98, "detected": 0.79, "onsets_per_hour": 6.0}))
-    exam = exam_figures(file)
+    exam = simulated_exam(file)
     assert (exam["auroc_1"], exam["auroc_2"], exam["warned"]) == (0.98, None, 0.79)
     row = alarm_row(corner(2, 2), [[np.ones(81, bool)] * 4], draw())
     last = alarm_table({"ours": row}, "alarm", "alarms", exam).lines()[-1]

@@ -161,7 +161,7 @@ class _Beam:
     order: int = 0
 
 
-def trace(fronts: Fronts, point_m: FloatArray, orders: int = ORDERS) -> Images:
+def trace_images(fronts: Fronts, point_m: FloatArray, orders: int = ORDERS) -> Images:
     """Trace the beams from a point (2,) up to a number of reflections."""
     numbers: dict[tuple[float, ...], int] = {}
     images, found = list[tuple[object, ...]](), list[tuple[object, ...]]()
@@ -228,11 +228,11 @@ def _side(fronts: Fronts, wall: int, apex_m: FloatArray) -> FloatArray:
 @lru_cache(maxsize=256)
 def images_at(site: Site, x_m: float, y_m: float) -> Images:
     """Return the traced beams of a place of a site, from a cache."""
-    return trace(drawn_fronts(site), np.array([x_m, y_m]))
+    return trace_images(drawn_fronts(site), np.array([x_m, y_m]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Way:
+class ImagePath:
     """One path from a source to the microphones at the emission knots."""
 
     gain: FloatArray  # shape (T, 8): Amplitude without spherical spreading
@@ -268,7 +268,7 @@ def _add_near(street: StreetSound, source: PlacedSource, x_m: float, span: slice
         audible = share * (level > FAINTEST * loud.max(axis=0))
         whole[span] = way.gain * air_gain(length) * road * audible[:, None]
 
-        def travel(position: FloatArray, way: Way = way) -> FloatArray:
+        def travel(position: FloatArray, way: ImagePath = way) -> FloatArray:
             out = np.zeros(len(whole))
             out[span] = receiver.arrivals(source.time_s, partial(way.length_m, position))[0]
             return out
@@ -277,7 +277,7 @@ def _add_near(street: StreetSound, source: PlacedSource, x_m: float, span: slice
         add_to_all(street.static.out, emission, whole, travel, receiver, fades=not receiver.ego.stands)
 
 
-def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]:
+def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[ImagePath]:
     """Return the paths of all visible images of a source, and of its diffracted waves."""
     images = images_at(site, *centre_m[:2].round(3).tolist())
     place = np.stack([source.x_m, source.y_m, np.ones_like(source.x_m)])
@@ -285,7 +285,7 @@ def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]
     # At the shadow boundary half of the amplitude remains: a quarter from this path, a quarter round the
     # corner.
     seen = [
-        Way(lit[number, :, None] ** 2 * images.kept[number], place[:2], 0.0, images, number, height)
+        ImagePath(lit[number, :, None] ** 2 * images.kept[number], place[:2], 0.0, images, number, height)
         for number in np.flatnonzero(lit.any(axis=1)).tolist()
     ]
     return [*seen, *_diffracted(site, images, lit, place, centre_m, height)]
@@ -293,7 +293,7 @@ def ways_of(site: Site, source: PlacedSource, centre_m: FloatArray) -> list[Way]
 
 def _diffracted(
     site: Site, images: Images, lit: FloatArray, place: FloatArray, centre_m: FloatArray, height_m: float
-) -> Iterator[Way]:
+) -> Iterator[ImagePath]:
     """Yield the paths from images of a source in an arm round its corner to images of the microphones."""
     keys = [_key(one) for one in images.mirror]
     knots = np.arange(lit.shape[1])
@@ -316,7 +316,7 @@ def _diffracted(
                 gain = corner_gain(tuple(corner - at), *(unfolded[:, some] - at[:, None]))
                 gain *= hidden[:, None] * images.kept[ear] * arm.kept[there]
                 gain = np.stack([np.interp(knots, some, band) for band in gain.T], axis=1)
-                way = Way(gain, corner[:, None], before, images, ear, height_m)
+                way = ImagePath(gain, corner[:, None], before, images, ear, height_m)
                 yield replace(way, gain=gain * way.length_m(centre_m)[:, None])
 
 

@@ -121,14 +121,14 @@ def azimuths_rad() -> FloatArray:
 def reached(site: Site, height_m: float, x_m: float = 0.0) -> Reached:
     """Trace the rays of a site once, from the ego's stop or from another place on its way there."""
     rays = RAYS if x_m == 0.0 else RAYS // 4
-    return trace(drawn_houses(site), height_m, site_generator(site.name, "rays"), rays, x_m)
+    return trace_rays(drawn_houses(site), height_m, site_generator(site.name, "rays"), rays, x_m)
 
 
 def _reached_by(receiver: Receiver, site: Site, x_m: float = 0.0) -> Reached:
     return reached(site, round(float(receiver.centre_m[2]), 3), x_m)
 
 
-def trace(
+def trace_rays(
     houses: Houses, height_m: float, rng: np.random.Generator, rays: int = RAYS, x_m: float = 0.0
 ) -> Reached:
     r"""Send rays from the array at (x, 0) and a height, and collect their energy in the plan.

@@ -14,7 +14,7 @@ from worldstate.simulation.scene.junction import drawn_site
 from worldstate.simulation.scene.presets import preset
 from worldstate.simulation.sound import mirrors, rays
 from worldstate.simulation.sound.delay import Emission
-from worldstate.simulation.sound.mirrors import FADE_M, Fronts, add_mirrored, drawn_fronts, trace
+from worldstate.simulation.sound.mirrors import FADE_M, Fronts, add_mirrored, drawn_fronts, trace_images
 from worldstate.simulation.sound.rays import Houses, _at, azimuths_rad, reached
 from worldstate.simulation.sound.static_field import PlacedSource
 
@@ -65,7 +65,7 @@ def test_image_sources_equal_those_of_pyroomacoustics(corners, absorbing, place)
     seen = room.visibility[0][0] > 0
     away, damping = room.sources[0].images[:, seen].T - EAR, room.sources[0].damping[0, seen]
     expected = sorted(zip(np.hypot(*away.T).tolist(), damping.tolist(), strict=True))
-    found = reaching(trace(closed(corners, kept), EAR, 3), EAR, np.array(place))
+    found = reaching(trace_images(closed(corners, kept), EAR, 3), EAR, np.array(place))
     audible = [[way for way in ways if way[1] > 0.0] for ways in (found, expected)]
     assert len(audible[1]) > 2
     np.testing.assert_allclose(audible[0], audible[1], rtol=1e-5)
@@ -80,7 +80,7 @@ def test_paths_are_reciprocal(plan, ahead, y, own_x, own_y) -> None:
     left, right = plan.side_wall_left_m, plan.side_wall_right_m
     ear = np.array([plan.corner_ahead_m - 8.0 * own_x, own_y * (left + right) - right])
     fronts = drawn_fronts(plan)
-    there, back = (reaching(trace(fronts, a, 5), a, b) for a, b in ((ear, place), (place, ear)))
+    there, back = (reaching(trace_images(fronts, a, 5), a, b) for a, b in ((ear, place), (place, ear)))
     np.testing.assert_allclose(there, back, rtol=1e-6)
     loudest, straight = float(fronts.kept.max()), float(np.hypot(*(place - ear)))
     orders = [np.log(gain) / np.log(loudest) for _, gain in there]
@@ -92,7 +92,7 @@ def test_paths_are_reciprocal(plan, ahead, y, own_x, own_y) -> None:
 @settings(max_examples=20, deadline=None)
 def test_the_direct_path_has_weight_one_only_in_view(plan, y) -> None:
     """The tolerance excludes the transition at the edge of the shadow."""
-    images, lane = trace(drawn_fronts(plan), EAR), plan.lanes_m[0]
+    images, lane = trace_images(drawn_fronts(plan), EAR), plan.lanes_m[0]
     (right, left), direct = plan.sight_m(lane), images.order == 0
     inside, behind = (
         np.array([0.0, left - 2.0 * FADE_M]),
@@ -189,7 +189,7 @@ def walled_yard(scattered: float = 0.0) -> Houses:
 def test_specular_rays_equal_image_sources() -> None:
     """Energy and directions of all echoes against images of pyroomacoustics in the same yard."""
     pra = pytest.importorskip("pyroomacoustics")
-    found = rays.trace(walled_yard(), EAR_M, np.random.default_rng(1), rays=400_000)
+    found = rays.trace_rays(walled_yard(), EAR_M, np.random.default_rng(1), rays=400_000)
     places = np.array([(-8.0, -3.0), (5.0, 7.0), (11.0, -6.0)])
     energy = _at(found.energy, *places.T)[:, :, 1]
     wall, sky, road = pra.Material(1.0 - KEPT), pra.Material(1.0), pra.Material(0.0)
@@ -214,7 +214,7 @@ def test_specular_rays_equal_image_sources() -> None:
 
 def test_rough_walls_scatter_without_loss() -> None:
     """Scattering spreads energy over directions and keeps its sum."""
-    smooth, rough = (rays.trace(walled_yard(s), EAR_M, np.random.default_rng(2)) for s in (0.0, 1.0))
+    smooth, rough = (rays.trace_rays(walled_yard(s), EAR_M, np.random.default_rng(2)) for s in (0.0, 1.0))
     place = np.array([10.0]), np.array([6.0])
     shares = [_at(one.energy, *place)[0, :, 3] for one in (smooth, rough)]
     entropy = [-(p / p.sum() * np.log(p / p.sum() + 1e-12)).sum() for p in shares]

@@ -28,7 +28,7 @@ from worldstate.adapters.files.file_io import write_text
 from worldstate.cli.common.output import CommandResult, output_folder, write_report
 from worldstate.cli.common.progress import progress_bar
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate_lab.report.table import Cell, Table, Value, plain
+from worldstate_lab.report.table import Cell, Table, Value, json_values
 from worldstate_lab.signatures.clip_signatures import ClipSignatures, hear_clips
 from worldstate_lab.signatures.signature_study import (
     IDMT,
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     corpora = _heard(IDMT, roadside, arguments.jobs), _heard(MELAUDIS, city, arguments.jobs)
     with progress_bar("measuring", len(QUESTIONS)) as bar:
         study = signature_study(*corpora, draws, bar.advance)
-    report, lines = plain(study), study_lines(study)
+    report, lines = json_values(study), study_lines(study)
     if study.left_out:
         lines += ["", f"left out: {len(study.left_out)} clips; the first: {study.left_out[0]}"]
     if arguments.out is not None:

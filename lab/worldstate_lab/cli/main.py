@@ -14,7 +14,7 @@ from worldstate.adapters.files.file_io import check_target, read_json, write_tex
 from worldstate.cli.common.command import CommandParser, Program, run_program
 from worldstate.cli.common.output import CommandResult
 from worldstate.ground.errors import InputFileError
-from worldstate_lab.report.table import plain
+from worldstate_lab.report.table import json_values
 
 BENCH = "worldstate_lab.cli.bench"
 STUDIES = {
@@ -127,7 +127,7 @@ def keep_results(
         "commit": _commit(),
         "seeds": _seeds(arguments),
         "smoke": bool(getattr(arguments, "smoke", False)),
-        "figures": plain(figures),
+        "figures": json_values(figures),
     }
     write_text(path, json.dumps(found, allow_nan=False, indent=1, sort_keys=True) + "\n")
 

@@ -39,7 +39,7 @@ from worldstate.cli.model.fit import add_group
 from worldstate.frontend.array.microphone_array import roof_array_56
 from worldstate.ground.checks import in_range
 from worldstate_lab.paper.identifiability import ReachOfArray, reach_of_array, reach_on_table
-from worldstate_lab.report.table import Table, plain
+from worldstate_lab.report.table import Table, json_values
 from worldstate_lab.signatures.clip_signatures import BandProfile, band_profile
 
 # Up to endfire of a transverse array, at which the bound diverges.
@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         table = read_features(arguments.features).group(arguments.group)
         data = reach_on_table(table, arguments.method, np.random.default_rng(arguments.seed))
     found = {"array": array, "features": data, "bands": bands}
-    report = {name: plain(one) for name, one in found.items() if one is not None}
+    report = {name: json_values(one) for name, one in found.items() if one is not None}
     columns = np.degrees([array.azimuths_rad, array.std_rad, array.with_vision_rad]).tolist()
     heads = ("azimuth (deg)", "std (deg)", "with camera", "share")
     rows = list(zip(*columns, array.endfire.tolist(), strict=True))

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         for name in dict.fromkeys(chain.from_iterable(SCENARIOS[name] for name in names))
         for seed, site in sites
     ]
-    found = in_processes(partial(followed, model=model, folder=arguments.streams), plan, arguments.jobs)
+    found = in_processes(partial(follow_plan, model=model, folder=arguments.streams), plan, arguments.jobs)
     streams: dict[str, list[Followed]] = {}
     for settings, one in zip(plan, track(found, "following", len(plan)), strict=True):
         streams.setdefault(settings.traffic.name, []).append(one)
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     return CommandResult({"scenarios": rows}, table={}, lines=figure_lines(rows, ".3f"))
 
 
-def followed(settings: StreamSettings, model: Model, folder: Path) -> Followed:
+def follow_plan(settings: StreamSettings, model: Model, folder: Path) -> Followed:
     """Return a stream with the filter's output, rendered unless it is in the folder."""
     if model.domain is None:
         raise InvalidArgumentError("model: expected one with an array, got one without")

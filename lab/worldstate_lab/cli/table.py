@@ -56,7 +56,7 @@ from worldstate_lab.evaluation.evaluation import (
 from worldstate_lab.evaluation.figures import FIGURES, titles
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.degradation_section import degradation_record, sweep_tables
-from worldstate_lab.report.table import Cell, Table, Value, plain, write_document
+from worldstate_lab.report.table import Cell, Table, Value, json_values, write_document
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
 from worldstate_lab.trials.listening import model_refusal
@@ -211,7 +211,7 @@ def _report(found: Evaluation) -> dict[str, Any]:
         "degradation": None if found.degradation is None else degradation_record(found.degradation),
         "front_end": None if study is None else {**study.figures, "bearing_srp_by_junction": study.by_site},
     }
-    return dict(plain(report))
+    return dict(json_values(report))
 
 
 def _lines(found: Evaluation) -> list[str]:

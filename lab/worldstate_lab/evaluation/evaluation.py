@@ -22,7 +22,14 @@ from worldstate_lab.degradation.degradation_study import (
 from worldstate_lab.metrics.intervals import DRAWS, stratified_draws
 from worldstate_lab.trials.classification import Classifiers
 from worldstate_lab.trials.listening import model_refusal
-from worldstate_lab.trials.pass_cache import Failed, Hearer, PassCache, attempted, fingerprint, hear
+from worldstate_lab.trials.pass_cache import (
+    Failed,
+    Hearer,
+    PassCache,
+    attempted,
+    fingerprint,
+    trials_and_failures,
+)
 from worldstate_lab.trials.trial import TakeList, Trial
 
 from .front_end_study import FrontEndStudy, front_end_study
@@ -82,7 +89,8 @@ def evaluate(
     """Process all recordings, run every protocol for which they suffice and score every method."""
     lacking_data(takes)
     every = (*takes.static, *takes.dynamic)
-    trials, failed = hear(track(attempted(hearing, every, jobs, attrgetter("name")), "listening", len(every)))
+    work = attempted(hearing, every, jobs, attrgetter("name"))
+    trials, failed = trials_and_failures(track(work, "listening", len(every)))
     left = _left(takes, trials)
     # Checked again on the remaining recordings: in a small data set one broken recording may be too many.
     lacking = lacking_data(left, failed)

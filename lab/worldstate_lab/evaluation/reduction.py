@@ -54,7 +54,7 @@ def alarm_counts(trial: Trial, said: Decisions) -> dict[str, float]:
 
 def awareness_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     """Count the hops after T0 with a vehicle in view, and those of them with an alarm or any moving box."""
-    clear = in_view(trial, said)
+    clear = hops_in_view(trial, said)
     # Any moving box: in real recordings it is not known which vehicle a box shows.
     seen = np.zeros(len(said.time_s), bool)
     at = hop_of(trial.boxes.time_s, said.time_s)
@@ -62,7 +62,7 @@ def awareness_counts(trial: Trial, said: Decisions) -> dict[str, float]:
     return {"clear_hops": float(clear.sum()), "aware_hops": float((clear & (said.alarm | seen)).sum())}
 
 
-def in_view(trial: Trial, said: Decisions) -> BoolArray:
+def hops_in_view(trial: Trial, said: Decisions) -> BoolArray:
     """Return a mask of the hops after T0 with a moving reference box in view, shape (n,)."""
     after = (not trial.hazard_free) & ~trial.hops.before_sight()
     return np.asarray(after & np.isfinite(trial.hops.reference_rad))
@@ -109,7 +109,7 @@ def probability_bins(risk: FloatArray) -> FloatArray:
 
 def bearing_samples(trial: Trial, said: Decisions, recording: int) -> HopTable:
     """Return absolute bearing errors and prominences of the peaks for hops with a reference box in view."""
-    use = in_view(trial, said) & np.isfinite(said.bearing_rad)
+    use = hops_in_view(trial, said) & np.isfinite(said.bearing_rad)
     error_rad = np.abs(wrap_angle(said.bearing_rad[use] - trial.hops.reference_rad[use]))
     columns = (np.full(error_rad.size, recording), error_rad, trial.hops.prominence[use])
     return HopTable(dict(zip(BEARING_COLUMNS, columns, strict=True)))

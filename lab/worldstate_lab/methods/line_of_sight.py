@@ -24,7 +24,7 @@ PERIODS = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Images:
+class TrialImages:
     """Times of the images of a trial, and the latest image at every hop."""
 
     time_s: FloatArray  # shape (images,)
@@ -37,7 +37,7 @@ class Images:
         Examples
         --------
         >>> seen = {"frame": np.array([9, 12]), "time_s": np.array([0.9, 1.2])}
-        >>> images = Images.of(Trial(HopTable({"time_s": np.array([1.0, 1.3, 1.5])}), HopTable(seen)))
+        >>> images = TrialImages.of(Trial(HopTable({"time_s": np.array([1.0, 1.3, 1.5])}), HopTable(seen)))
         >>> images.time_s.round(1)[-4:].tolist(), images.of_hop.tolist()
         ([1.2, 1.3, 1.4, 1.5], [10, 13, 15])
         """
@@ -94,7 +94,7 @@ class VisionOnly:
 
 
 def _seen(trial: Trial) -> Decisions:
-    boxes, images = trial.boxes, Images.of(trial)
+    boxes, images = trial.boxes, TrialImages.of(trial)
     azimuth = np.full(len(images.time_s), np.nan)
     if len(boxes):
         moving = np.flatnonzero(boxes.moving)
@@ -201,7 +201,7 @@ class OcSortRecovery:
         return self._decide
 
     def _decide(self, trial: Trial) -> Decisions:
-        images, time_s = Images.of(trial), trial.hops.time_s
+        images, time_s = TrialImages.of(trial), trial.hops.time_s
         # A single box is not a confirmed track and must not coast.
         counts = attrgetter("certain" if self.reading == "stock" else "known")
         held = [list(filter(counts, tracks)) for tracks in _moving_tracks(trial, images, self.keep)]
@@ -220,7 +220,7 @@ class OcSortRecovery:
         return Decisions.of(time_s, found, side=sides(bearing), bearing_rad=bearing, tracks=tracks)
 
 
-def _moving_tracks(trial: Trial, images: Images, keep: DetectionFilter) -> Iterator[list[TrackedBox]]:
+def _moving_tracks(trial: Trial, images: TrialImages, keep: DetectionFilter) -> Iterator[list[TrackedBox]]:
     """Yield the tracks of moving vehicles in every image."""
     # Detectors with a lower minimum score would have almost no boxes above the published one.
     sort = OcSort(min(keep.min_score, MIN_SCORE))

@@ -1,7 +1,7 @@
 """The table type of all studies: printed, written as JSON and CSV, and inserted into pages.
 
 A study returns its findings as `Table` values, and its pictures as `Figure` values. A command prints
-``table.lines()`` and includes ``plain(findings)`` in its JSON report. A `Document`
+``table.lines()`` and includes ``json_values(findings)`` in its JSON report. A `Document`
 combines tables and figures in `report.md`, a Markdown page with its figures and numbers as files; all files
 are written, or none.
 """
@@ -103,7 +103,7 @@ class Table:
     Leads
     method        lead (s)
     ours    1.70 [1.30, 2.10]
-    >>> plain(table)["rows"]
+    >>> json_values(table)["rows"]
     [['ours', [1.7, 1.3, 2.1]]]
     """
 
@@ -178,27 +178,27 @@ def _figure_text(value: float | None, form: str) -> str:
     return MISSING if value is None else format(value, "d" if isinstance(value, int) else form)
 
 
-def plain(value: Any) -> Any:
+def json_values(value: Any) -> Any:
     """Return findings as JSON-compatible values: nested dataclasses, tuples and arrays, null for NaN.
 
     Examples
     --------
-    >>> plain({"lead": Value(1.5), "beta": np.array([0.5, np.nan]), "out": Path("a")})
+    >>> json_values({"lead": Value(1.5), "beta": np.array([0.5, np.nan]), "out": Path("a")})
     {'lead': 1.5, 'beta': [0.5, None], 'out': 'a'}
     """
     if isinstance(value, Value):
         known = all(map(math.isfinite, (value.low, value.high)))
-        return plain([value.value, value.low, value.high] if known else value.value)
+        return json_values([value.value, value.low, value.high] if known else value.value)
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return json_values(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
+        return {str(key): json_values(one) for key, one in value.items()}
     if is_dataclass(value):
-        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+        return {one.name: json_values(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
+        return [json_values(one) for one in value]
     return str(value) if isinstance(value, Path) else value
 
 

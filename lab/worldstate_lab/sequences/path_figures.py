@@ -36,7 +36,7 @@ SEEDS = 5  # The same number as in `table --full`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
+class PathRun:
     """Recordings processed on one path; all sequences have the same order."""
 
     recordings: Sequence[CornerRecording]
@@ -122,7 +122,7 @@ class HopScore:
     of: BySide  # shape (n,) or (n, 2)
     sides: BySide | None = None  # shape (n, 2): Values that give the side if the score itself has no sides
 
-    def figures(self, path: Heard, rng: np.random.Generator) -> dict[str, Any]:
+    def figures(self, path: PathRun, rng: np.random.Generator) -> dict[str, Any]:
         """Return the figures of the score, and of right minus left if it has sides."""
         trials = path.seen if self.seen else path.alone
         found, sides = (list(map(of, trials)) for of in (self.of, self.sides or self.of))
@@ -200,7 +200,7 @@ SCORES = (
 )
 
 
-def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dict[str, Any]:
+def path_figures(path: PathRun, classifiers: Classifiers | None, seed: int) -> dict[str, Any]:
     """Return every figure of a path; without classifiers, rows of the published classifier are missing."""
     rng = np.random.default_rng(seed)
     methods = (*_OWN, *_SIGHT, *(_TABLE if classifiers else ()))
@@ -221,7 +221,7 @@ def path_figures(path: Heard, classifiers: Classifiers | None, seed: int) -> dic
     }
 
 
-def _rows(run: ProtocolRun, path: Heard, rng: np.random.Generator) -> dict[str, Row]:
+def _rows(run: ProtocolRun, path: PathRun, rng: np.random.Generator) -> dict[str, Row]:
     """Return the row of every method, and of the shipped alarm with sound alone."""
     alone = [[one.chains["filtered"].alarm for one in path.alone]]
     rows = {"world-state advisory, sound alone": alarm_row(path.alone, alone, rng)}
@@ -250,7 +250,7 @@ _EXAM = {
 }
 
 
-def exam_figures(path: Path) -> dict[str, float | None]:
+def simulated_exam(path: Path) -> dict[str, float | None]:
     """Return those figures of a path that the simulated exam of a model contains too."""
     exam: Any = read_json(path, "exam of a model")
     return {name: exam.get(other) for name, other in _EXAM.items()}

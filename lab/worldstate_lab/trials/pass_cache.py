@@ -238,7 +238,7 @@ class Hearer:
         return Trial(hops, heard["boxes"], heard["truth"], chains)
 
 
-def hear(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
+def trials_and_failures(heard: Iterable[Trial | Failed]) -> tuple[list[Trial], list[Failed]]:
     """Return the trials in the order of the recordings, and the failed recordings."""
     every = list(heard)
     return [one for one in every if isinstance(one, Trial)], [one for one in every if isinstance(one, Failed)]

@@ -29,7 +29,7 @@ from worldstate.commissioning.commission import parts_of, stream_evidence
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import FloatArray
-from worldstate_lab.report.table import Cell, Table, Value, plain
+from worldstate_lab.report.table import Cell, Table, Value, json_values
 from worldstate_lab.sequences.hearing import PathName, corner_chain, heard
 from worldstate_lab.sequences.recordings import read_recordings
 from worldstate_lab.streets.column_distances import (
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         tables["statistics"] = _statistics_table(parts)
     counts = {name: [sum(one.hazard for one in some), len(some)] for name, some in parts.items()}
     lines = [line for table in tables.values() for line in (*table.lines(), "")]
-    return CommandResult(plain({"excerpts": counts, **tables}), table={}, lines=lines)
+    return CommandResult(json_values({"excerpts": counts, **tables}), table={}, lines=lines)
 
 
 def _distance_table(found: Mapping[str, Distances]) -> Table:

@@ -41,7 +41,7 @@ from worldstate_lab.evaluation.protocols import (
     run_protocol,
 )
 from worldstate_lab.metrics.intervals import worst_group
-from worldstate_lab.report.table import Cell, Table, Value, plain
+from worldstate_lab.report.table import Cell, Table, Value, json_values
 from worldstate_lab.sequences.hearing import SPECTRA, Chain, heard, ovad_chain
 from worldstate_lab.sequences.path_figures import classifiers_of
 from worldstate_lab.sequences.path_tables import alarm_table
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     tables = [table for one in (FIXED, RETRAINED) for table in _tables(one, found[one.name])]
     report = {"recordings": len(trials), "windows": len(classifiers.windows or ()), "protocols": found}
     lines = [line for table in tables for line in (*table.lines(), "")]
-    return CommandResult(plain(report), table={}, lines=lines)
+    return CommandResult(json_values(report), table={}, lines=lines)
 
 
 def _heard(chain: Chain, recording: CornerRecording) -> Trial:

@@ -36,17 +36,17 @@ from worldstate.cli.common.progress import track
 from worldstate.commissioning.heard_stream import HeardStream
 from worldstate.ground.checks import in_range
 from worldstate.ground.errors import InvalidArgumentError
-from worldstate_lab.report.table import plain
+from worldstate_lab.report.table import json_values
 from worldstate_lab.sequences.hearing import PAIR, SPECTRA, Chain, PathName, corner_chain
 from worldstate_lab.sequences.path_figures import (
     SEEDS,
-    Heard,
+    PathRun,
     classifiers_of,
-    exam_figures,
     front_end_figures,
     heard_every_way,
     path_figures,
     score_figures,
+    simulated_exam,
 )
 from worldstate_lab.sequences.path_tables import FOLLOWED, path_lines, scores_table
 from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         paths = get_args(PathName)
     chains = [corner_chain(path, arguments.folder, arguments.model, boxes) for path in paths]
     report: dict[str, Any] = {"start_s": start_s, "boxes": arguments.boxes}
-    lines, heard = list[str](), dict[PathName, Heard]()
+    lines, heard = list[str](), dict[PathName, PathRun]()
     for chain in chains:
         heard[chain.path], failed = _heard(chain, recordings, arguments.jobs)
         report[chain.path] = _figures(arguments, chain, heard[chain.path]) | {"failed": failed}
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
         report["sums"] = _sums(arguments, heard, chains[0])
         for path, sums in report["sums"].items():
             lines += scores_table(sums, f"{path}: sums that are not shipped, sound alone").lines()
-    return CommandResult(plain(report), table={}, lines=lines)
+    return CommandResult(json_values(report), table={}, lines=lines)
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -113,22 +113,22 @@ def _check_kinds(recordings: Sequence[CornerRecording], found: str) -> None:
         raise InvalidArgumentError(f"recordings: expected approaches and hazard-free ones; {found}")
 
 
-def _heard(chain: Chain, recordings: Sequence[CornerRecording], jobs: int) -> tuple[Heard, dict[str, str]]:
+def _heard(chain: Chain, recordings: Sequence[CornerRecording], jobs: int) -> tuple[PathRun, dict[str, str]]:
     work = attempted(partial(heard_every_way, chain), recordings, jobs, attrgetter("name"))
     done = list(track(work, f"listening, {chain.path}", len(recordings)))
     heard = [(one, *two) for one, two in zip(recordings, done, strict=True) if not isinstance(two, Failed)]
     failed = {one.name: one.problem for one in done if isinstance(one, Failed)}
     _check_kinds([one for one, *_ in heard], next(iter(failed.values()), ""))
-    return Heard(*zip(*heard, strict=True)), failed
+    return PathRun(*zip(*heard, strict=True)), failed
 
 
-def _figures(arguments: argparse.Namespace, chain: Chain, heard: Heard) -> dict[str, Any]:
+def _figures(arguments: argparse.Namespace, chain: Chain, heard: PathRun) -> dict[str, Any]:
     published = chain.path in SPECTRA and arguments.features
     classifiers = classifiers_of(arguments.features, arguments.lists) if published else None
     found = path_figures(heard, classifiers, arguments.seed)
     exam = arguments.exam or arguments.folder / PAIR / EXAM
     if chain.path == "pair" and exam.exists():
-        found["exam"] = exam_figures(exam)
+        found["exam"] = simulated_exam(exam)
     # Measurements of other modules on the same recordings are merged here.
     rng = np.random.default_rng(arguments.seed)
     followed = [one for one in heard.followed if one is not None]
@@ -136,7 +136,7 @@ def _figures(arguments: argparse.Namespace, chain: Chain, heard: Heard) -> dict[
     return found | {"front_end": front_end_figures(heard.seen, heard.recordings, rng)}
 
 
-def _sums(arguments: argparse.Namespace, heard: Mapping[PathName, Heard], seven: Chain) -> dict[str, Any]:
+def _sums(arguments: argparse.Namespace, heard: Mapping[PathName, PathRun], seven: Chain) -> dict[str, Any]:
     """Return by path the performance of sums of parts on recordings of all paths."""
     levels = LevelReading.learned([HeardStream.load(one) for one in arguments.streams], seven.model)
     found = dict[str, Any]()

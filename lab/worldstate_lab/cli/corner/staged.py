@@ -37,7 +37,7 @@ from worldstate_lab.degradation.beta_curves import BetaCurves
 from worldstate_lab.degradation.conditions import FAMILIES, at_level
 from worldstate_lab.evaluation.report.approach_panel import approach_figure, approach_images
 from worldstate_lab.metrics.intervals import stratified_draws
-from worldstate_lab.report.table import Cell, Table, Value, plain
+from worldstate_lab.report.table import Cell, Table, Value, json_values
 from worldstate_lab.sequences.hearing import heard, ovad_chain
 from worldstate_lab.sequences.recordings import CornerRecording, read_recordings
 from worldstate_lab.sequences.staged_looks import (
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> CommandResult:
     }
     tables = [*_beta_tables(curves), _vision_table(rows)]
     lines = [line for one in tables for line in ("", *one.lines())]
-    return CommandResult(plain(report), table={}, lines=lines)
+    return CommandResult(json_values(report), table={}, lines=lines)
 
 
 def _stage(staging: Staging, recordings: Sequence[CornerRecording], jobs: int) -> None:

@@ -10,7 +10,7 @@ from worldstate_lab.degradation.beta_curves import Band
 from worldstate_lab.degradation.conditions import FAMILIES, OFF
 from worldstate_lab.degradation.degradation_study import DegradationStudy, DetectorSweep
 from worldstate_lab.evaluation.figures import COMMANDS, paper_value
-from worldstate_lab.report.table import Cell, Figure, Section, Table, Value, plain
+from worldstate_lab.report.table import Cell, Figure, Section, Table, Value, json_values
 
 from .measured_values import Place
 from .panels import awareness_figure
@@ -91,7 +91,7 @@ def sweep_tables(study: DegradationStudy) -> list[Table]:
 
 def degradation_record(study: DegradationStudy) -> dict[str, Any]:
     """Return all results ready for JSON; unknown values are null."""
-    record: dict[str, Any] = plain(
+    record: dict[str, Any] = json_values(
         {
             **{name: getattr(study, name) for name in ("approaches", "hazard_free", "skipped", "missing")},
             "beta_shift": study.beta_shift,
