@@ -163,6 +163,7 @@ def test_every_table_states_its_data_and_every_mean_its_worst_junction(evaluatio
     assert {"table_i", "calibration", "protocol_junctions_fixed"} <= {
         name for name, block in blocks.items() if block.caption.startswith(told)
     }
+    assert {row[2] for row in blocks["junctions"].rows} == {"8"}
     table = blocks["table_i"]
     row = next(row for row in table.rows if row[0] == "proposed .02")
     sites = evaluation.scores["static"]["proposed .02"].by_site()

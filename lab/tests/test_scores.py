@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from made_up_trials import alarmed, made_up, random_answer, random_study, tracked
 from scipy.stats import chi2
 from sklearn.metrics import brier_score_loss, roc_auc_score
-from worldstate_lab.evaluation.scores import Score
+from worldstate_lab.evaluation.scores import BASELINE, DETECTED, OURS, Score, equal_detection
 from worldstate_lab.metrics.intervals import calibration_error_sampling, stratified_draws
 from worldstate_lab.metrics.track_measures import gated_median_deg
 from worldstate_lab.trials.trial import TRUTH_COLUMNS, Trial
@@ -203,6 +203,13 @@ def test_figures_are_means_over_seeds():
     close(Score.of(trials, passes).figures(), {n: np.mean([one[n] for one in each]) for n in each[0]})
 
 
+def test_a_method_that_no_seed_changes_is_scored_once():
+    trials, (answers,) = random_study(np.random.default_rng(9))
+    assert len(Score.of(trials, [answers] * 3).wins) == 1
+    # Copies may differ in fields that are not compared: they are scored like any other pass.
+    assert len(Score.of(trials, [answers, [replace(one) for one in answers]]).wins) == 2
+
+
 def test_a_mirrored_world_has_the_same_figures():
     trials, (answers,) = random_study(np.random.default_rng(4))
     other = {"left": "right", "right": "left", "none": "none"}
@@ -227,6 +234,14 @@ def test_a_mirrored_world_has_the_same_figures():
     assert Score.of(mirrored, [answers]).figures()["side_correct"] != ours["side_correct"]
 
 
+def detector(trials, rate, rng):
+    """Return alarms that detect each approach with a given probability, a second before T0."""
+    return [
+        alarmed(trial, [(4.0, 4.5)] if not trial.hazard_free and rng.random() < rate else [])
+        for trial in trials
+    ]
+
+
 @pytest.mark.long
 def test_intervals_contain_the_truth_in_most_experiments():
     rng = np.random.default_rng(7)
@@ -235,10 +250,7 @@ def test_intervals_contain_the_truth_in_most_experiments():
     ]
     held = 0
     for _ in range(50):
-        # Each approach is detected with a given probability, a second before T0.
-        found = [not one.hazard_free and rng.random() < 0.7 for one in trials]
-        said = [alarmed(one, [(4.0, 4.5)] * hit) for one, hit in zip(trials, found, strict=True)]
-        score = Score.of(trials, [said])
+        score = Score.of(trials, [detector(trials, 0.7, rng)])
         low, high = score.intervals(stratified_draws(score.strata, rng, 120))["detection"]
         held += low <= 0.7 <= high
     # 95 % minus the undercoverage of a bootstrap of 40 recordings; four standard deviations of the share are
@@ -256,6 +268,36 @@ def test_false_alarms_have_their_exact_interval():
     assert low_high["false_alarms_per_hour_poisson"] == pytest.approx(expected)
 
 
+def scored(trial, levels):
+    """Return decisions of which only the score is used: a level from each start on, for half a second."""
+    time_s, score = trial.hops.time_s, np.full(len(trial.hops), 0.01)
+    for start_s, level in levels:
+        score[(time_s > start_s - 1e-6) & (time_s < start_s + 0.5 - 1e-6)] = level
+    return alarmed(trial, [], score=score)
+
+
+def test_false_alarms_are_compared_at_equal_detection():
+    near = [made_up(f"a{i}", "left", t0_s=7.0) for i in range(10)]
+    calm = [made_up("c"), made_up("d")]
+    trials = [*near, *calm]
+    # Ours separates nine of ten from a false burst that is as high as the tenth; the baseline separates none.
+    ours = [scored(one, [(5.5, 0.9 if i else 0.2)]) for i, one in enumerate(near)]
+    ours += [scored(calm[0], [(3.0, 0.5)]), scored(calm[1], [])]
+    theirs = [scored(one, [(5.5, 0.6)]) for one in near] + [
+        scored(one, [(2.0, 0.8), (5.0, 0.8)]) for one in calm
+    ]
+    draws = stratified_draws([trial.label for trial in trials], np.random.default_rng(0), 100)
+    found = {one.detected: one for one in equal_detection(trials, {OURS: [ours], BASELINE: [theirs]}, draws)}
+    hours = 162 * 0.1 / 3600.0
+    assert tuple(found) == DETECTED
+    assert found[0.9].ours == 0.0 and found[0.9].baseline == pytest.approx(4 / hours)
+    assert found[0.9].ratio == found[0.9].low == 0.0
+    # Detecting the tenth costs the burst as a false alarm.
+    assert found[0.95].ours == pytest.approx(1 / hours) and found[0.95].ratio == pytest.approx(0.25)
+    assert found[0.95].low == 0.0 and found[0.95].high <= 0.5
+    assert not equal_detection(trials, {BASELINE: [theirs]}, draws)
+
+
 def test_figures_by_site_include_the_worst_one():
     good, bad = made_up("a", "left", site="SA1"), made_up("b", "left", site="SB1")
     calm = made_up("c", site="SC1")
@@ -270,9 +312,9 @@ def test_values_that_a_method_does_not_give_are_missing():
     trials = [made_up("a", "left"), made_up("c")]
     score = Score.of(trials, [[alarmed(one, []) for one in trials]])
     figures = score.figures()
-    stated = "detection", "false_alarms_per_hour", "advisory_share", "random_detection", "hazard_awareness"
-    assert np.isfinite([figures[name] for name in stated]).all()
-    silent = (
+    stated = {"detection", "false_alarms_per_hour", "advisory_share", "random_detection", "hazard_awareness"}
+    assert all(np.isfinite(figures[name]) for name in stated)
+    silent = {
         "side_correct",
         "auroc_all",
         "ece",
@@ -281,8 +323,8 @@ def test_values_that_a_method_does_not_give_are_missing():
         "brier_skill",
         "bearing_deg",
         "lead_s",
-    )
-    assert np.isnan([figures[name] for name in silent]).all()
+    }
+    assert all(np.isnan(figures[name]) for name in silent)
     # Log-odds are a score, but not a probability.
     odds = [alarmed(one, [], score=np.linspace(-3.0, 3.0, 81)) for one in trials]
     figures = Score.of(trials, [odds]).figures()

@@ -56,6 +56,7 @@ from worldstate_lab.evaluation.evaluation import (
 from worldstate_lab.evaluation.figures import FIGURES, titles
 from worldstate_lab.evaluation.report.contents import evaluation_document
 from worldstate_lab.evaluation.report.degradation_section import degradation_record, sweep_tables
+from worldstate_lab.evaluation.report.warning_sections import equal_table
 from worldstate_lab.report.table import Cell, Table, Value, json_values, write_document
 from worldstate_lab.trials import classification as windows
 from worldstate_lab.trials.classification import Classifiers, model_from_windows
@@ -208,6 +209,7 @@ def _report(found: Evaluation) -> dict[str, Any]:
             }
             for name, scores in found.scores.items()
         },
+        "equal_detection": found.equal,
         "degradation": None if found.degradation is None else degradation_record(found.degradation),
         "front_end": None if study is None else {**study.figures, "bearing_srp_by_junction": study.by_site},
     }
@@ -220,6 +222,7 @@ def _lines(found: Evaluation) -> list[str]:
     for name, run in found.runs.items():
         lines += ["", *_warnings(found, name).lines(), *run.cautions]
         lines += [f"not scored: {method}: {why}" for method, why in found.refused.get(name, {}).items()]
+        lines += equal_table(found, name).lines() if found.equal.get(name) else []
     tables = [] if found.degradation is None else sweep_tables(found.degradation)
     return [*lines, *(line for table in tables for line in ("", *table.lines()))]
 

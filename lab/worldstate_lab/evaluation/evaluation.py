@@ -34,7 +34,7 @@ from worldstate_lab.trials.trial import TakeList, Trial
 
 from .front_end_study import FrontEndStudy, front_end_study
 from .protocols import PROTOCOLS, ProtocolRun, methods_for, refused_methods, run_protocol
-from .scores import Score
+from .scores import EqualDetection, Score, equal_detection
 
 # Yields the items of a step, of which there are so many, and reports progress.
 Progress = Callable[[Iterable[Any], str, int], Iterator[Any]]
@@ -65,6 +65,8 @@ class Evaluation:
     settings: EvaluationSettings
     # By protocol and method that is not scored: why its model does not fit the sound of a recording.
     refused: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    # By protocol with folds over recordings.
+    equal: Mapping[str, Sequence[EqualDetection]] = field(default_factory=dict)
 
 
 def lacking_data(takes: TakeList, failed: Sequence[Failed] = ()) -> dict[str, str]:
@@ -112,6 +114,11 @@ def evaluate(
     standing = [trial for trial in trials if not trial.hops.about["moving"]]
     filmed = any(np.isfinite(trial.hops.reference_rad).any() for trial in standing)
     front_end = front_end_study(standing, rng, settings.draws) if filmed else None
+    equal = {
+        name: equal_detection(run.trials, run.decisions, drawn[name])
+        for name, run in runs.items()
+        if not run.protocol.by_junction
+    }
     sweep = None
     # Broken videos may leave too few recordings for a sweep; the other figures are kept in that case.
     if settings.degradation is not None:
@@ -121,7 +128,7 @@ def evaluate(
             lacking["degradation sweep"] = str(error)
     refused = {one.name: refused_methods(some) for one, some in own.items()}
     of = takes, tuple(trials), tuple(failed), lacking
-    return Evaluation(*of, runs, scores, drawn, front_end, sweep, settings, refused)
+    return Evaluation(*of, runs, scores, drawn, front_end, sweep, settings, refused, equal)
 
 
 def _scored(run: ProtocolRun, track: Progress) -> dict[str, Score]:

@@ -1,11 +1,16 @@
-"""Figures of every method and protocol, with intervals over recordings."""
+"""Figures of every method and protocol, with intervals over recordings.
 
-from collections.abc import Mapping, Sequence
+They include false alarms at equal detection: two alarm rules are compared at thresholds with equal detection.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from worldstate.abduction.cueing.cueing_policy import sustained_alarm
 from worldstate.abduction.cueing.risk_map import BINS
+from worldstate.commissioning.alarm_curve import raised_at
 from worldstate.ground.checks import check_shape
 from worldstate.ground.errors import InvalidArgumentError
 from worldstate.ground.typing import BoolArray, FloatArray, IndexArray
@@ -14,6 +19,7 @@ from worldstate.operations.metrics.approach_table import poisson_interval, rank_
 from worldstate.operations.recordings.hop_table import HOP_S, HopTable, joined
 from worldstate_lab.evaluation import reduction
 from worldstate_lab.evaluation.figures import FIGURES
+from worldstate_lab.methods.acoustic_rules import SUSTAIN_CHOICES
 from worldstate_lab.metrics.intervals import (
     Interval,
     draw_weights,
@@ -29,6 +35,8 @@ from worldstate_lab.metrics.intervals import (
 )
 from worldstate_lab.metrics.track_measures import PUBLISHED_COVERAGE
 from worldstate_lab.trials.trial import Decisions, Trial
+
+from .reduction import alarm_counts
 
 _HOURS = HOP_S / SECONDS_PER_HOUR
 _RATIOS = {name: (*kind.counts, kind.unit) for name, kind in FIGURES.items() if any(kind.counts)}
@@ -273,3 +281,108 @@ def _bearing_figures(samples: HopTable, weights: FloatArray) -> dict[str, FloatA
     gated = times * highest_share(samples.prominence, times, PUBLISHED_COVERAGE)
     kinds = {"bearing_deg": times, "bearing_gated_deg": gated}
     return {name: np.degrees(weighted_median(samples.error_rad, kept)) for name, kept in kinds.items()}
+
+
+BASELINE, OURS = "published, sustained", "world-state advisory"
+DETECTED = (0.8, 0.85, 0.9, 0.95)
+# Quantiles used as thresholds. Those of hazard-free hops are dense where few alarms remain. Those before T0
+# include the highest score of each approach, above which the approach is missed.
+_CALM_SHARES, _NEAR_SHARES = np.geomspace(1e-5, 0.5, 60), np.linspace(0.0, 1.0, 30)
+_COUNTS = ("approaches", "detected", "free_hops", "free_onsets")
+# Maps a score and a threshold to the alarm of a recording.
+Rule = Callable[[FloatArray, float], BoolArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OperatingCurve:
+    """Counts of the alarms at every threshold on every recording, shape (thresholds, R) each."""
+
+    counts: Mapping[str, FloatArray]
+
+    def alarms_per_hour(self, detected: float, weights: FloatArray) -> FloatArray:
+        """Return the lowest false-alarm rate of any threshold that detects this share, per hour, shape (D,).
+
+        Recording r has weight weights[d, r]; the result is infinite if no threshold detects the share.
+        """
+        sums = {name: weights @ count.T for name, count in self.counts.items()}
+        share = ratio(sums["detected"], sums["approaches"])
+        rate = ratio(sums["free_onsets"], sums["free_hops"] * HOP_S / SECONDS_PER_HOUR)
+        return np.asarray(np.where(share >= detected - 1e-9, rate, np.inf).min(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class EqualDetection:
+    """False alarms of two alarm rules at equal detection."""
+
+    detected: float
+    ours: float  # False alarms per hour; infinite if no threshold detects this share
+    baseline: float
+    ratio: float  # Ours divided by the baseline's, with the central 95 % over draws of recordings
+    low: float
+    high: float
+
+
+def operating_curve(
+    trials: Sequence[Trial], said: Sequence[Decisions], rules: Iterable[Rule]
+) -> OperatingCurve:
+    """Return the operating curve of several rules over all thresholds of their score."""
+    levels = _levels(trials, said)
+    rows = [
+        [_counted(trial, one, rule(one.score, level)) for trial, one in zip(trials, said, strict=True)]
+        for rule in rules
+        for level in levels
+    ]
+    return OperatingCurve({name: np.array([[one[name] for one in row] for row in rows]) for name in _COUNTS})
+
+
+def _levels(trials: Sequence[Trial], said: Sequence[Decisions]) -> list[float]:
+    """Return thresholds from the median of the hazard-free scores to a value above all of them."""
+    pairs = list(zip(trials, said, strict=True))
+    calm = np.concatenate([one.score for trial, one in pairs if trial.hazard_free])
+    near = [one.score[trial.hops.before_sight()] for trial, one in pairs if not trial.hazard_free]
+    found = [np.quantile(calm, 1.0 - _CALM_SHARES, method="higher"), [np.nextafter(calm.max(), np.inf)]]
+    found += [[one.max() for one in near if one.size]]
+    found += [np.quantile(np.concatenate(near), 1.0 - _NEAR_SHARES, method="higher")]
+    return [float(level) for level in np.unique(np.concatenate(found))]
+
+
+def equal_detection(
+    trials: Sequence[Trial], decisions: Mapping[str, Sequence[Sequence[Decisions]]], draws: IndexArray
+) -> list[EqualDetection]:
+    """Compare the world-state's alarm with the sustained baseline, each at its best threshold.
+
+    The baseline's sustained hops are chosen together with its threshold. The result is empty if a method is
+    missing.
+    """
+    if BASELINE not in decisions or OURS not in decisions:
+        return []
+    sustained = [_sustained(hops) for hops in SUSTAIN_CHOICES]
+    baseline = operating_curve(trials, decisions[BASELINE][0], sustained)
+    ours = operating_curve(trials, decisions[OURS][0], [_held])
+    weights = np.vstack([np.ones(len(trials)), draw_weights(draws, len(trials))])
+    return [_compared(share, ours, baseline, weights) for share in DETECTED]
+
+
+def _compared(
+    detected: float, ours: OperatingCurve, baseline: OperatingCurve, weights: FloatArray
+) -> EqualDetection:
+    a, b = (curve.alarms_per_hour(detected, weights) for curve in (ours, baseline))
+    # A draw may have no alarms or too few detected approaches for either rule: such a draw has no ratio.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = a / b
+    shares[1:][np.isinf(shares[1:])] = np.nan
+    return EqualDetection(detected, float(a[0]), float(b[0]), float(shares[0]), *middle(shares[1:]))
+
+
+def _counted(trial: Trial, said: Decisions, alarm: BoolArray) -> dict[str, float]:
+    found = alarm_counts(trial, Decisions.of(said.time_s, alarm))
+    return {name: found.get(name, 0.0) for name in _COUNTS}
+
+
+def _held(score: FloatArray, threshold: float) -> BoolArray:
+    """Return a sequence model's alarm: its score is averaged over 0.3 s, and the alarm lasts 1 s longer."""
+    return raised_at((score >= threshold).astype(float), 1.0)
+
+
+def _sustained(hops: int) -> Rule:
+    return lambda score, threshold: sustained_alarm(score >= threshold, hops)

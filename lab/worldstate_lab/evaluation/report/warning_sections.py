@@ -1,12 +1,13 @@
-"""Sections on warnings: Table I and calibrated cueing."""
+"""Sections on warnings: Table I, calibrated cueing, tracks."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from worldstate_lab.evaluation.evaluation import Evaluation
 from worldstate_lab.evaluation.protocols import STANDING
 from worldstate_lab.evaluation.reduction import HORIZONS_S, scored_windows
-from worldstate_lab.report.table import Figure, Section
+from worldstate_lab.report.table import Cell, Figure, Section, Table, Value
 from worldstate_lab.trials.trial import Decisions, Trial
 
 from .measured_values import PROPOSED, MeasuredValues
@@ -20,6 +21,7 @@ _WARNING = (
 )
 _AREAS = ("auroc_all", "auroc_2s", "auroc_1s")
 _CALIBRATION = (*_AREAS, "ece", "ece_floor", "ece_raw", "brier_skill", "hazard_share")
+_TRACKING = ("gospa_deg", "visible_error_s", "visible_error_constant_s", "visible_coverage")
 
 
 def table_i(measured: MeasuredValues) -> Section:
@@ -45,7 +47,24 @@ def table_i(measured: MeasuredValues) -> Section:
         f"Vision only: a moving box precedes T0 in {early.number} {early.note} approaches (paper: 3 of 42, "
         "attributed to the tolerance of the T0 annotation and printed as 0).",
     )
-    return Section("Table I", text, (table,))
+    return Section("Table I", text, (table, equal_table(measured.found, STANDING)))
+
+
+def equal_table(found: Evaluation, protocol: str) -> Table:
+    """Return the false alarms of the world-state and the sustained baseline at equal detection."""
+    rows: list[tuple[Cell, ...]] = []
+    for one in found.equal.get(protocol, ()):
+        rates = (Value(rate, digits=0) for rate in (one.ours, one.baseline))
+        rows.append((Value(one.detected), *rates, Value(one.ratio, one.low, one.high)))
+    return Table(
+        "equal_detection",
+        "False alarms at equal detection",
+        ("detected (share)", "world-state (1/h)", "published, sustained (1/h)", "ratio"),
+        rows,
+        f"{found.runs[protocol].basis} The lowest false-alarm rate at which each method detects this share, "
+        "over all thresholds, which are chosen on these recordings; for the baseline also over its "
+        "sustained hops.",
+    )
 
 
 def cueing_section(measured: MeasuredValues, awareness: Sequence[Figure]) -> Section:
@@ -107,3 +126,17 @@ def _points(measured: MeasuredValues) -> list[OperatingPoint]:
         for method in shown
         if method in measured.found.scores[STANDING]
     ]
+
+
+def tracking_section(measured: MeasuredValues) -> Section:
+    """Return GOSPA and time to visible of the methods that have any."""
+    table = measured.table(
+        STANDING,
+        measured.methods(STANDING, _TRACKING),
+        _TRACKING,
+        "tracking",
+        "Tracks and time to visible, standing ego",
+        "GOSPA on bearing with a cut-off of 60 degrees, mean over hops with a vehicle. Time to visible: "
+        "compared with the constant that fits best, which is computed from these approaches.",
+    )
+    return Section("Tracking measures", (), (table,))
