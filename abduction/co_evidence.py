@@ -159,8 +159,9 @@ class Present:
         ----------
         Derived here as the complement of `Absent`.
         """
-        spurious = np.log(self.clutter_rate)
-        found = np.log1p(-self.miss_rate * (1.0 - self.clutter_rate))
+        beta, kappa = self.miss_rate, self.clutter_rate
+        # This form of the sum keeps a small clutter rate if beta is 1.
+        spurious, found = np.log([kappa, (1.0 - beta) + beta * kappa])
         return np.array([spurious, found, spurious])
 
 

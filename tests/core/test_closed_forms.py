@@ -114,6 +114,12 @@ def test_the_answers_of_a_look_sum_to_one(miss_rate, clutter_rate) -> None:
     assert np.exp(nothing) == pytest.approx((1.0 - clutter_rate) * np.array([1.0, miss_rate, 1.0]))
 
 
+@given(st.floats(5e-324, 0.9))
+def test_a_sensor_that_always_misses_answers_alike_under_every_hypothesis(clutter_rate) -> None:
+    for answer in (Absent(1.0, clutter_rate), Present(1.0, clutter_rate)):
+        assert np.ptp(answer.log_likelihoods()) == pytest.approx(0.0, abs=1e-9)
+
+
 @given(SEEDS, UNIT)
 @settings(max_examples=20)
 def test_a_hidden_vehicle_beside_a_visible_one_mixes_prior_and_sound(seed, by_sound) -> None:
