@@ -59,7 +59,7 @@ _ALPHA = 0.02  # The paper's budget, for a model without a sequence
 # Sequence models were trained on bearings in the half plane ahead.
 _READ_SPAN_DEG = 180.0
 _SOUND_ONLY = f"The states hold bearings and tracks of sound, but no side, class or risk. {TRAIN}"
-# Assumed length of a stream or of microphones, whose end is not known.
+# A stream and microphones have no known length; this one is assumed.
 _ONE_DAY_S = 86_400.0
 # Closer time stamps have another unit, and so have stamps that begin with the sound and last this many times
 # longer.

@@ -591,7 +591,7 @@ def read_any_detections(
     frame_rate_hz : float, optional
         Frames per second if the frames carry no stamp; 10 by default.
     size_px : tuple of int, optional
-        Width and height of the image, to which YOLO text is relative.
+        Width and height of the image; coordinates in YOLO text are shares of them.
     n_images : int, optional
         Number of searched images, if COCO results or text do not list them.
 

@@ -132,8 +132,8 @@ class LiveSound(Audio):
         self._feed, self._keep = feed, keep
         self._channel: BoundedChannel[SoundBlock] = BoundedChannel(int(LONGEST_WAIT_S * BLOCKS_PER_SECOND))
         self._captured_s = time.monotonic()
-        # Offset from a block's number to that of the stream: it grows if the device stalls, and is None
-        # during a stall.
+        # Difference between the numbers of a block in the stream and on the device: it grows with each stall
+        # of the device, and is None during a stall.
         self._behind: int | None = 0
 
     @property

@@ -137,7 +137,7 @@ def add_to_all(
     *,
     fades: bool = False,
 ) -> None:
-    """Add a sound with gains (T, 8) to all microphones; `travel_m` (T,) is its path to a position."""
+    """Add a sound with gains (T, 8) to all microphones; `travel_m` returns its path to a position, (T,)."""
     made = emission.table(gain, fades=fades)
     if made is None:
         return

@@ -233,7 +233,7 @@ def band_filter(sample_rate_hz: float) -> FloatArray:
 def loudness_db(
     sound: EventSound, rows_s: FloatArray, sample_rate_hz: float, *, banded: bool = False
 ) -> FloatArray:
-    """Return the sound pressure level over the tenth of a second round each time, mean over microphones.
+    """Return the sound pressure level in a tenth of a second around each time, mean over microphones.
 
     The level is that of the whole spectrum or of `BAND_HZ`. Shapes: rows_s (R,).
     """

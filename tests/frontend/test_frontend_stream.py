@@ -107,7 +107,7 @@ def test_band_levels_of_white_noise_and_a_tone() -> None:
 def test_the_level_of_a_hop_is_that_of_the_frames_without_lost_samples() -> None:
     loud, quiet = (gain * np.random.default_rng(0).standard_normal((1024, 4)) for gain in (1.0, 0.1))
     both, alone = (LevelMeter(4, RATE, FrontEndSettings(nfft=512)) for _ in range(2))
-    # Of seven frames of 512 samples, 256 apart, the last three hold no loud sample.
+    # Seven frames of 512 samples begin 256 samples apart; the last three contain no loud sample.
     heard = np.array([False] * 4 + [True] * 3)
     level = both.push(np.vstack([loud, quiet]), heard=heard)
     np.testing.assert_allclose(level, alone.push(quiet), atol=1e-6)

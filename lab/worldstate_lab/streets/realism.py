@@ -138,7 +138,7 @@ def distance_figures(
     return boosted | {(f"AUROC of {name}", windows): area for (name, windows), area in single.items()}
 
 
-# Figures that are limited on one side only; the others may be neither too low nor too high.
+# These figures have a limit on one side only, above or below; all others have both limits.
 LOWER_IS_NEARER = ("C2ST", "AUROC of")
 HIGHER_IS_NEARER = ("share of medians", "side", "transfer")
 # The untrained scalar is a baseline to exceed, not a target.

@@ -122,7 +122,7 @@ def with_scores(hops: HopTable, stream: HopTable, model: Model) -> HopTable:
 
 
 def model_refusal(take: Take, model: Model) -> str | None:
-    """Return why a model does not fit the sound of a recording; None if it does, or specifies no array."""
+    """Return why a model does not fit the sound of a recording; None if it fits or has no array."""
     # An uncalibrated chain has no sequence model, but it raises no error before the reason is returned here.
     source = open_source(take.path, model=model, settings=replace(CHAINS["plain"], uncalibrated=True))
     domain = model.domain

@@ -144,7 +144,7 @@ class PassCache:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_named(path, make())
         write_text(sealed, _seal(path))
-        # Read back even if just written: JSON converts tuples in `about` to lists, and a resumed run must
+        # A new file is read back, because JSON converts tuples in `about` to lists, and a resumed run must
         # give the same values as an uninterrupted one.
         return load_named(path, "tables of a pass")
 

@@ -225,7 +225,7 @@ class HealthLog:
 
 
 def _one_cause(verdicts: list[ChannelVerdict]) -> tuple[ChannelVerdict, ...]:
-    """Keep, of misplaced channels, those with the main fault and at least half of its share of hops."""
+    """Keep the misplaced channels that have the main fault in at least half of its share of hops."""
     misplaced = [verdict for verdict in verdicts if verdict.fault in _MISPLACED]
     if any(verdict.fault is Fault.DRIFT for verdict in misplaced):
         # A drift begins as a delay.
