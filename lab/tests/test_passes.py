@@ -20,7 +20,7 @@ from worldstate_lab.passes.followed_stream import (
     EVERYBODY,
     FollowedStream,
     PassedStream,
-    followed,
+    filtered,
     stream_detections,
     stream_measurements,
 )
@@ -106,7 +106,7 @@ def heard(made_up: HeardStream, lag_s: float = 0.4) -> list[Measurement]:
 def passed(vehicles: list[Vehicle], duration_s: float = 60.0) -> PassedStream:
     """Return a stream with the beliefs of the filter."""
     made_up = stream(vehicles, duration_s)
-    return PassedStream(made_up, stream_truth(made_up), followed(WorldFilter(Context()), heard(made_up)))
+    return PassedStream(made_up, stream_truth(made_up), filtered(WorldFilter(Context()), heard(made_up)))
 
 
 def figures_of(vehicles: list[Vehicle], duration_s: float = 60.0) -> Figures:

@@ -128,7 +128,7 @@ class PassedStream:
     followed: FollowedStream
 
 
-def followed(
+def filtered(
     world: WorldFilter, measurements: Iterable[Measurement], street: StreetListener | None = None
 ) -> FollowedStream:
     """Filter a stream; return the belief after every measurement. `street` learns from passes."""
@@ -180,7 +180,7 @@ def passed_stream(path: Path, model: Model, camera: CameraKind = "all", seed: in
     heard, measured = stream_measurements(path, model, camera, seed, street)
     settings = FilterSettings(street=model.street or StreetModel())
     world = WorldFilter(Context(), model.policies.for_alpha(0.02), settings)
-    return PassedStream(heard, stream_truth(heard), followed(world, measured, street))
+    return PassedStream(heard, stream_truth(heard), filtered(world, measured, street))
 
 
 def stream_measurements(
