@@ -9,15 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from street_measurements import SILENT, car, hop
 
-from worldstate import FilterSettings, Sighting, WorldFilter
+from worldstate import Context, FilterSettings, Sighting, SignatureEvidence, WorldFilter
 from worldstate.abduction.co_evidence import Absent, Present, Unqueried
 from worldstate.abduction.cueing.cueing_policy import CueingPolicy
 from worldstate.abduction.cueing.risk_map import IsotonicMap
 from worldstate.belief.street_model import StreetModel
+from worldstate.ground.errors import InvalidArgumentError
 from worldstate.measurement import Approach, Bearing
 
 QUIET = (0.1, 0.1, 0.1, 0.7)
 LEFT = (0.97, 0.01, 0.01, 0.01)
+SILENCE = (0.01, 0.01, 0.01, 0.97)
+RIGHT = (0.01, 0.97, 0.01, 0.01)
 FRONT = (0.01, 0.01, 0.97, 0.01)
 POLICY = CueingPolicy(0.85, 3, 0.02, (0.25,) * 4, IsotonicMap((0.0, 0.5, 1.0), (0.0, 0.3, 0.95)))
 
@@ -222,3 +225,94 @@ def test_the_same_stream_has_the_same_ids_and_another_one_others():
     states = [run(one, approach_from_left())[1] for one in worlds]
     first, same, other = ([one.id for state in many for one in state.entities] for many in states)
     assert first == same and not set(first) & set(other)
+
+
+def test_an_old_approach_rate_fades():
+    """Approach at 0.8 1/s, then visible for three seconds without an approach rate."""
+    script = [measured(t, LEFT, approach=Approach(0.8, 0.1)) for t in hops(1.0, 4.0)]
+    script += [measured(t, FRONT, car(0.4)) for t in hops(4.0, 7.0)]
+    _, states = run(start(), script)
+    assert states[29].entities[0].tta_s < 2.0
+    assert states[-1].entities[0].tta_s is None
+    assert abs(states[-1].entities[0].inverse_tta_hz) < 0.4
+
+
+def test_two_vehicles_one_seen_and_one_hidden():
+    """A visible vehicle does not explain the evidence of a hidden one on the other side."""
+    script = [measured(t, RIGHT) for t in hops(1.0, 4.0)]
+    script += [measured(t, FRONT, car(-0.5 + 0.02 * (t - 4.0))) for t in hops(4.0, 6.0)]
+    script += [measured(t, LEFT, car(-0.46), answer=Absent(0.04)) for t in hops(6.0, 9.0)]
+    trucks = [(t, replace(car(0.5 - 0.3 * (t - 9.0)), label="truck")) for t in hops(9.0, 10.0)]
+    script += [measured(t, LEFT, car(-0.46), truck) for t, truck in trucks]
+    _, states = run(start(), script)
+    at = {s.stamp_ns: s for s in states}
+    first = {e.id for e in at[3_900_000_000].entities}
+    both = at[8_900_000_000].entities
+    assert [(e.status, e.direction) for e in both] == [("visible", "right"), ("hidden", "left")]
+    end = at[9_900_000_000].entities
+    assert [(e.status, e.direction) for e in end] == [("visible", "right"), ("visible", "left")]
+    assert [e.id for e in end] == [e.id for e in both]
+    assert end[0].id in first
+
+
+def test_two_hidden_vehicles_hand_over_to_their_own_sides():
+    """If vehicles are usual on both sides, evidence of both sides makes two entities."""
+    both, busy = (0.49, 0.49, 0.01, 0.01), Context(hidden_by_side={"left": 0.8, "right": 0.8})
+    script = [measured(t, both) for t in hops(1.0, 4.0)]
+    script += [measured(t, both, car(0.5), car(-0.5)) for t in hops(4.0, 4.5)]
+    _, states = run(start(context=busy), script)
+    before = {e.direction: e.id for e in states[-6].entities}
+    assert set(before) == {"left", "right"}
+    seen = [e for e in states[-1].entities if e.status == "visible"]
+    assert {("left" if e.azimuth_rad > 0 else "right"): e.id for e in seen} == before
+
+
+def test_a_faint_belief_is_not_handed_over():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)] + [measured(t, SILENCE) for t in hops(4.0, 7.0)]
+    settings_ = FilterSettings(street=StreetModel(death=1e-3))
+    world, states = run(WorldFilter(policy=POLICY, settings=settings_), script)
+    (faint,) = states[-1].entities
+    assert faint.existence_probability < 0.02
+    world = world.update(measured(7.0, SILENCE, car(-0.5)))
+    assert {e.status: e.id == faint.id for e in world.state.entities}["visible"] is False
+
+
+def test_a_visible_vehicle_does_not_raise_the_next_hidden_one():
+    """A visible vehicle has a track; the existence of the next one is only its hidden probability."""
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    in_view = [car(0.5 - 0.3 * (t - 4.0)) for t in hops(4.0, 7.5)]
+    script += [measured(t, FRONT, one) for t, one in zip(hops(4.0, 5.5), in_view, strict=False)]
+    script += [measured(t, LEFT, one) for t, one in zip(hops(5.5, 7.5), in_view[15:], strict=True)]
+    world, next_ones = start(), []
+    for measurement in script:
+        world = world.update(measurement)
+        if world.stamp_ns > 4 * 10**9:
+            next_ones += [(e, world.belief) for e in world.state.entities if e.status == "hidden"]
+    assert len(next_ones) > 10 and len({e.id for e, _ in next_ones}) == 1
+    for entity, belief in next_ones:
+        assert entity.existence_probability == pytest.approx(belief.hidden_on(None), abs=0.03)
+
+
+def test_a_moving_car_drives_past_a_parked_one():
+    script = [measured(t, FRONT, car(0.4 - 0.2 * (t - 1.0)), car(0.0, moving=False)) for t in hops(1.0, 5.0)]
+    _, states = run(start(), script)
+    first, last = ({e.moving: e.id for e in s.entities} for s in (states[0], states[-1]))
+    assert first == last
+    assert len(states[-1].entities) == 2
+
+
+def test_a_hand_over_lowers_the_risk():
+    script = [measured(t, LEFT) for t in hops(1.0, 4.0)]
+    script.append(measured(4.0, LEFT, car(0.5), answer=Unqueried("sector out of view")))
+    _, states = run(start(), script)
+    assert states[-2].risk > 0.7
+    assert states[-1].risk < 1.0 / 6.0  # As often another one follows
+    assert states[-1].cues[0].hypotheses.visible > 0.7
+
+
+def test_a_measurement_of_other_directions_raises_an_error_without_effect():
+    world = start().update(measured(2.0, LEFT))
+    before, other = world.state, SignatureEvidence(("north",), (0.0,), 0.0, 0.0)
+    with pytest.raises(InvalidArgumentError, match="expected one of the directions"):
+        world.update(replace(measured(2.1, LEFT), signature=other))
+    assert world.state == before

@@ -9,7 +9,7 @@ from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from street_measurements import ABSENT, PRESENT, SEEDS, after, car, diagonal, hop
+from street_measurements import ABSENT, PRESENT, SEEDS, after, car, diagonal, hop, reading
 
 from worldstate import Context, FilterSettings, Measurement, Sighting, WorldFilter, WorldState
 from worldstate.abduction.co_evidence import Absent
@@ -298,3 +298,52 @@ def test_the_line_of_sight_turns_with_the_approach_to_the_corner(speed_mps, told
     usual = [Context(ego_speed_mps=speed_mps), Context()]
     moving, standing = (after(heard(0.1), radio(0.1, crossing(0.1)), world=WorldFilter(one)) for one in usual)
     assert moving.risk == pytest.approx(standing.risk, abs=1e-9)
+
+
+def test_messages_on_both_sides_raise_both_advisories() -> None:
+    """With a sequence model below its threshold, and without one."""
+    for said in (None, reading({}, 1.0)):
+        world = WorldFilter()
+        for at in range(1, 8):
+            left = crossing(at / 10)
+            right = replace(left, position_m=(10.0, -left.position_m[1]), velocity_mps=(0.0, 8.0))
+            sound = replace(heard(at / 10), sequence=said)
+            world = after(sound, radio(at / 10 + 0.05, left, right), world=world)
+        cues = world.state.cues
+        assert [bool(cue.advisory) for cue in cues] == [True, True]
+        assert {cue.evidence.hypothesis for cue in cues} == {"announced"}
+        assert sorted(one.direction for one in world.state.entities) == ["left", "right"]
+        assert not any(cue.advisory for cue in world.predict(1.2).state.cues)
+
+
+def test_a_position_is_published_only_while_it_is_precise() -> None:
+    world = after(*[radio(at / 10, crossing(at / 10 - 40.0)) for at in range(1, 5)])
+    later = [world.predict(wait_s).state.entities for wait_s in (0.0, 2.0, 4.5, 7.0)]
+    told = [[one.position_m is not None for one in entities] for entities in later]
+    assert told == [[True], [True], [False], []]
+
+
+def test_a_radar_detection_at_the_edge_is_a_hand_over() -> None:
+    world = after(*[heard(at / 10, left=4.0) for at in range(1, 15)])
+    (before,) = world.state.entities
+    edge, elsewhere = (
+        Position((r * math.cos(a), r * math.sin(a)), diagonal(0.3, 0.3)) for r, a in ((12, 0.5), (30, 0.0))
+    )
+    (found,) = after(radar(1.45, edge), world=world).state.entities
+    assert (found.id, found.status) == (before.id, "visible")
+    both = after(radar(1.45, elsewhere), world=world).state.entities
+    assert [one.status for one in both] == ["hidden", "visible"] and both[0].id == before.id
+
+
+@given(st.integers(1, 4), SEEDS)
+@settings(max_examples=10, deadline=None)
+def test_certain_visible_vehicles_exclude_the_hypothesis_none(cars: int, seed: int) -> None:
+    rng, world = np.random.default_rng(seed), WorldFilter()
+    lanes = [(15.0 + 8.0 * k, float(rng.uniform(-4.0, 4.0))) for k in range(cars)]
+    for at in range(1, 12):
+        there = [Position((x + 0.3 * at, y), diagonal(0.4, 0.4, 0.3, 0.3), (3.0, 0.0)) for x, y in lanes]
+        scan = radar(at / 10 + 0.02, *there, detection_probability=0.9)
+        world = after(heard(at / 10), scan, world=world)
+    for cue in world.state.cues:
+        said = cue.hypotheses
+        assert said.none < 0.05 and said.hidden + said.visible + said.none == pytest.approx(1.0)
