@@ -45,14 +45,12 @@ def typestore() -> Any:
 def message(name: str, values: Mapping[str, Any]) -> Any:
     """Return a message of a type; missing fields are zero or empty, and others raise KeyError."""
     store = typestore()
-    if unknown := values.keys() - dict(store.fielddefs[name][1]):
+    kinds = dict(store.fielddefs[name][1])
+    if unknown := values.keys() - kinds:
         raise KeyError(f"{name} has no {', '.join(unknown)}")
-    fields = {
-        field: _value(kind, values.get(field))
-        for field, kind in store.fielddefs[name][1]
-        # Only rosbags has this field, in empty messages; ROS does not.
-        if field != "structure_needs_at_least_one_member"
-    }
+    # Only rosbags has this field, in empty messages; ROS does not.
+    kinds.pop("structure_needs_at_least_one_member", None)
+    fields = {field: _value(kind, values.get(field)) for field, kind in kinds.items()}
     return store.types[name](**fields)
 
 
